@@ -1,0 +1,1 @@
+"""The Lanestream client: frames to a service, lane lines back."""

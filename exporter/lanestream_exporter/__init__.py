@@ -1,0 +1,1 @@
+"""Everything that runs offline, up to the ONNX file: labels, rendered scenes, training, evaluation, export."""

@@ -1,0 +1,1 @@
+"""Readers of labelled frames, each yielding the one in-memory form of `labels`."""

@@ -1,0 +1,1 @@
+"""Lanestream: camera frames in, tracked lane lines out."""

@@ -1,0 +1,68 @@
+"""Finding lane boundaries in one frame.
+
+A detector splits its work in two, so that the network between the halves can be shared by many cameras: `prepare`
+makes network inputs from an image, `finish` makes detections from the network's outputs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from lanestream.geometry import RoadView
+    from lanestream.lanes import Candidate, Detection, Image
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A frame on its way through a detector: network inputs (N, H, W, 3) uint8, and what `finish` needs again.
+
+    `view` is the frame's road view with the horizon that was used. `seen_horizon` is the row that this frame alone
+    suggests, None where it shows too little, and `horizon_weight` (0 to 1) how much it has to say.
+    """
+
+    image: Image
+    inputs: NDArray[np.uint8]
+    view: RoadView
+    candidates: tuple[Candidate, ...] = ()
+    seen_horizon: float | None = None
+    horizon_weight: float = 0.0
+
+
+class LaneDetector(Protocol):
+    """The two halves of a detector. Both are pure and may run in any thread."""
+
+    def prepare(self, image: Image, horizon: float | None = None) -> Prepared:
+        """Network inputs for a BGR image; `horizon` is a row known from elsewhere, else it is estimated."""
+        ...
+
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:
+        """Detections from the network's outputs for `prepared.inputs`, row by row."""
+        ...
+
+
+class Network(Protocol):
+    """What runs between the halves: a loaded network."""
+
+    @property
+    def name(self) -> str:
+        """The model's name and version, for people."""
+        ...
+
+    @property
+    def provider(self) -> str:
+        """The execution provider that really runs it."""
+        ...
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the model file says of itself."""
+        ...
+
+    def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Outputs (N, classes) for inputs (N, H, W, 3) in RGB; N may be 0."""
+        ...

@@ -1,0 +1,41 @@
+"""The whole way of a frame in one place: a detector, its network, and the steps between image and result."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from lanestream.detection import LaneDetector, Network
+from lanestream.sessions import Session
+
+if TYPE_CHECKING:
+    from lanestream.lanes import FrameResult, Image
+
+
+class Engine:
+    """A loaded network and its detector, shared by all sessions of a process."""
+
+    def __init__(self, detector: LaneDetector, network: Network) -> None:
+        self.detector = detector
+        self.network = network
+
+    def open_session(self, horizon: float | None = None) -> Session:
+        """A session for one camera; `horizon` is its row as a share of the image height, estimated where None."""
+        return Session(self.detector, horizon)
+
+    def process(self, session: Session, image: Image, timestamp: float) -> FrameResult:
+        """One frame from image to lanes, in the calling thread, with the milliseconds of each stage."""
+        started = time.perf_counter()
+        prepared = session.prepare(image)
+        proposed = time.perf_counter()
+        outputs = self.network.run(prepared.inputs)
+        inferred = time.perf_counter()
+        result = session.conclude(prepared, outputs, timestamp)
+        tracked = time.perf_counter()
+        timing = {
+            "propose": 1e3 * (proposed - started),
+            "infer": 1e3 * (inferred - proposed),
+            "track": 1e3 * (tracked - inferred),
+        }
+        return replace(result, timing_ms=timing)

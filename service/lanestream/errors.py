@@ -1,0 +1,133 @@
+"""Every error that a user can meet: one root, stable codes, one table from code to HTTP status and close code.
+
+A message says what was wrong; a hint says what is accepted or what to do. Both are one line and safe to show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+class LanestreamError(Exception):
+    """The root of all errors that Lanestream raises on purpose.
+
+    `code` is stable and meant for programs, `message` says what was wrong, `hint` what is accepted or what to do.
+    """
+
+    code: str = "internal"
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return f"{self.message} ({self.hint})" if self.hint else self.message
+
+
+class ImageError(LanestreamError):
+    """A frame that can't be decoded or is outside the limits."""
+
+    code = "bad_image"
+
+
+class ImageTooLargeError(ImageError):
+    """A frame with more bytes or more pixels than the limits allow."""
+
+    code = "image_too_large"
+
+
+class ModelError(LanestreamError):
+    """A model file that can't be loaded or does not describe itself."""
+
+    code = "bad_model"
+
+
+class ProviderError(LanestreamError):
+    """An execution provider was required and can't be had on this machine."""
+
+    code = "provider_unavailable"
+
+
+class ProtocolError(LanestreamError):
+    """A stream message that is malformed or arrives where it is not allowed."""
+
+    code = "bad_message"
+
+
+class OverrunError(LanestreamError):
+    """A client sent more frames than it was granted in mode `all`."""
+
+    code = "overrun"
+
+
+class BusyError(LanestreamError):
+    """The service is at its session limit."""
+
+    code = "busy"
+
+
+class SettingsError(LanestreamError):
+    """A setting, or a command line, with a value that is not accepted."""
+
+    code = "bad_settings"
+
+
+class SourceError(LanestreamError):
+    """A video source, an image or a folder that can't be read, or a sink that can't be written."""
+
+    code = "bad_source"
+
+
+class ConnectionFailedError(LanestreamError):
+    """The client can't reach the service, or lost it."""
+
+    code = "connection_failed"
+
+
+class LabelError(LanestreamError):
+    """A label file with a record that can't be used."""
+
+    code = "bad_labels"
+
+
+class CheckpointError(LanestreamError):
+    """A checkpoint that can't be loaded, or that does not fit the network."""
+
+    code = "bad_checkpoint"
+
+
+class ExportError(LanestreamError):
+    """An export that missed its tolerance; no file is left behind."""
+
+    code = "export_failed"
+
+
+class MissingExtraError(LanestreamError):
+    """A feature whose optional packages are not installed."""
+
+    code = "missing_extra"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How an error is told: the HTTP status, and the WebSocket close code where it ends the stream."""
+
+    http_status: int
+    close_code: int
+
+
+_INTERNAL: Final = Answer(500, 1011)
+_ANSWERS: Final[dict[str, Answer]] = {
+    ImageError.code: Answer(415, 1003),
+    ImageTooLargeError.code: Answer(413, 1009),
+    ProtocolError.code: Answer(422, 1002),
+    OverrunError.code: Answer(429, 1008),
+    BusyError.code: Answer(503, 1013),
+}
+
+
+def answer_to(error: BaseException) -> Answer:
+    """How `error` is answered over HTTP and over a WebSocket."""
+    return _ANSWERS.get(error.code, _INTERNAL) if isinstance(error, LanestreamError) else _INTERNAL

@@ -1,0 +1,116 @@
+"""Where things are: image pixels, the working image, the road region and the strips along candidates.
+
+All transforms of pixels go through `Scaling`, so that no factor is ever loose. Pixel centres are at integers, hence a
+resize by s maps x to s (x + 0.5) - 0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.lanes import Curve, FloatArray
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """A uniform resize from image pixels to working pixels; `factor` is working size over image size."""
+
+    factor: float
+
+    def to_working(self, value: float) -> float:
+        """An image column or row, in working pixels."""
+        return (value + 0.5) * self.factor - 0.5
+
+    def to_image(self, value: float) -> float:
+        """A working column or row, in image pixels."""
+        return (value + 0.5) / self.factor - 0.5
+
+    def curve_to_image(self, curve: Curve) -> Curve:
+        """A working curve, in image pixels."""
+        c0, c1, c2 = curve.coefficients
+        return Curve(self.to_image(curve.row), (self.to_image(c0), c1, c2 * self.factor))
+
+    def curve_to_working(self, curve: Curve) -> Curve:
+        """An image curve, in working pixels."""
+        c0, c1, c2 = curve.coefficients
+        return Curve(self.to_working(curve.row), (self.to_working(c0), c1, c2 / self.factor))
+
+
+@dataclass(frozen=True)
+class RoadView:
+    """What of an image can be road: all below the horizon. Sizes and rows in pixels of that image."""
+
+    width: int
+    height: int
+    horizon: float
+
+    @property
+    def bottom(self) -> float:
+        """The lowest row."""
+        return self.height - 1.0
+
+    @property
+    def depth(self) -> float:
+        """Rows between the horizon and the bottom: the scale of everything on the road."""
+        return self.bottom - self.horizon
+
+    def scaled(self, scaling: Scaling, width: int, height: int) -> RoadView:
+        """The same view of the working image, which is `width` x `height`."""
+        return RoadView(width, height, scaling.to_working(self.horizon))
+
+    def row_at(self, share: float) -> float:
+        """The row at `share` of the way from the horizon (0) to the bottom (1)."""
+        return self.horizon + share * self.depth
+
+
+def visible_rows(curve: Curve, view: RoadView, top_share: float) -> tuple[float, float] | None:
+    """The (top, bottom) rows between which `curve` is inside the image and `top_share` of the depth below the horizon.
+
+    None where fewer than two rows of it are in view. Where a bent curve leaves and comes back, the part that begins
+    nearest to the camera counts.
+    """
+    rows = np.linspace(view.bottom, view.row_at(top_share), 65)
+    columns = curve.x(rows)
+    inside = (columns >= 0.0) & (columns <= view.width - 1.0)
+    if not inside.any():
+        return None
+    first = int(np.argmax(inside))
+    outside_again = np.flatnonzero(~inside[first:])
+    last = first + int(outside_again[0]) - 1 if len(outside_again) else len(rows) - 1
+    top, bottom = float(rows[last]), float(rows[first])
+    return (top, bottom) if bottom - top >= 2.0 else None
+
+
+@dataclass(frozen=True)
+class StripGeometry:
+    """How a strip along a candidate is cut: `size` x `size` network pixels, wide in proportion to the road's scale.
+
+    At a row y the strip reaches `half_width` (y - horizon) to either side of its candidate, a constant width on a flat
+    road, and never less than `min_half_width` pixels of a 640 pixel wide image.
+    """
+
+    size: int = 224
+    half_width: float = 0.5
+    min_half_width: float = 5.0
+
+    def rows(self, top: float, bottom: float) -> FloatArray:
+        """Image rows of the patch rows, from the top of the patch to its bottom; shape (size,)."""
+        return np.linspace(top, bottom, self.size)
+
+    def half_widths(self, rows: FloatArray, view: RoadView) -> FloatArray:
+        """Half the strip's width in pixels at each of `rows`."""
+        least = self.min_half_width * view.width / 640.0
+        widths: FloatArray = np.maximum(self.half_width * (rows - view.horizon), least)
+        return widths
+
+    def grid(
+        self, curve: Curve, top: float, bottom: float, view: RoadView
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Image (columns, rows) that the pixels of a patch are sampled at, each (size, size)."""
+        rows = self.rows(top, bottom)
+        across = np.linspace(-1.0, 1.0, self.size)
+        columns = curve.x(rows)[:, None] + self.half_widths(rows, view)[:, None] * across[None, :]
+        return columns.astype(np.float32), np.broadcast_to(rows[:, None], columns.shape).astype(np.float32)

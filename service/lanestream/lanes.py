@@ -1,0 +1,132 @@
+"""Value objects: what the detectors find and the tracker follows.
+
+Coordinates are pixels of the original image: x right, y down, floats, pixel centres at integers. Every boundary is a
+function x(y) of the image row, because lane boundaries run away from the camera and cross each row once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Image = NDArray[np.uint8]
+State = Literal["detected", "predicted"]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A boundary as x(y) = c0 + c1 (y - row) + c2 (y - row)^2, in pixels; a straight line has c2 = 0."""
+
+    row: float
+    coefficients: tuple[float, float, float]
+
+    @classmethod
+    def through(cls, rows: FloatArray, columns: FloatArray) -> Curve:
+        """The curve through three points at three different rows, its reference at the first of them."""
+        basis = np.vander(np.asarray(rows, dtype=float) - rows[0], 3, increasing=True)
+        c0, c1, c2 = np.linalg.solve(basis, columns)
+        return cls(float(rows[0]), (float(c0), float(c1), float(c2)))
+
+    def x(self, y: FloatArray | float) -> FloatArray:
+        """Columns at the rows `y`; the shape of the answer is that of `y`."""
+        t = np.asarray(y, dtype=float) - self.row
+        c0, c1, c2 = self.coefficients
+        columns: FloatArray = np.asarray(c0 + t * (c1 + t * c2))
+        return columns
+
+    def slope(self, y: FloatArray | float) -> FloatArray:
+        """dx/dy at the rows `y`."""
+        slopes: FloatArray = np.asarray(self.coefficients[1] + 2.0 * self.coefficients[2] * (np.asarray(y) - self.row))
+        return slopes
+
+    def moved_to(self, row: float) -> Curve:
+        """The same curve, told from another reference row."""
+        c0, c1, c2 = self.coefficients
+        t = row - self.row
+        return Curve(row, (c0 + t * (c1 + t * c2), c1 + 2.0 * c2 * t, c2))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A possible boundary, straight from the extended Hough transform.
+
+    `top` and `bottom` are the rows between which it is in view and on the road. `strength` orders candidates of one
+    frame (more is better). `marking_width` is the distance between its two edges divided by the distance of the row
+    from the horizon, the same at every row of a flat road; None for a single unpaired edge.
+    """
+
+    curve: Curve
+    top: float
+    bottom: float
+    strength: float
+    marking_width: float | None = None
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A boundary found in one frame.
+
+    `covariance` (3, 3) belongs to the curve's coefficients at its reference row. `probability` is the calibrated chance
+    that this is a lane boundary.
+    """
+
+    curve: Curve
+    covariance: FloatArray
+    top: float
+    bottom: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class LaneBoundary:
+    """A tracked boundary: a detection with an identity, a history and a place beside the camera.
+
+    `position` is -1 for ego left, +1 for ego right, -2 and +2 for the next ones out. `age_s` counts from its first
+    detection. `state` tells whether a detection of this frame backs it (`detected`) or the filter carries it.
+    """
+
+    track_id: int
+    position: int
+    state: State
+    probability: float
+    curve: Curve
+    covariance: FloatArray
+    top: float
+    bottom: float
+    age_s: float
+
+
+@dataclass(frozen=True)
+class LaneChange:
+    """The camera crossed the boundary `track_id`, towards `direction`."""
+
+    track_id: int
+    direction: Literal["left", "right"]
+
+
+@dataclass(frozen=True)
+class EgoLane:
+    """The lane the camera is in: the track ids of its boundaries and where the camera is between them.
+
+    `offset` is the camera's distance from the lane's centre as a share of the lane width at the bottom row, positive to
+    the right; None unless both boundaries are known.
+    """
+
+    left: int | None = None
+    right: int | None = None
+    offset: float | None = None
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """All that is known after one frame: boundaries from left to right, the ego lane, events, the horizon's row."""
+
+    lanes: tuple[LaneBoundary, ...]
+    ego: EgoLane
+    horizon: float
+    events: tuple[LaneChange, ...] = ()
+    timing_ms: dict[str, float] = field(default_factory=dict)

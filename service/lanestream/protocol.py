@@ -1,0 +1,195 @@
+"""The wire contract: the messages of `/v1/stream` and `/v1/detect`, and the rules of their order.
+
+Light on purpose: pydantic and the standard library only, so that the client can share it. Coordinates are pixels of the
+image that was sent (x right, y down, pixel centres at integers), timestamps are seconds on the client's clock.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from lanestream.errors import ProtocolError
+
+SUBPROTOCOL: Final = "lanestream.v1"
+
+Point = tuple[float, float]
+Mode = Literal["latest", "all"]
+
+
+class Message(BaseModel):
+    """A JSON object on the wire; a field that nobody knows is an error, so that a typing slip is seen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StartMessage(Message):
+    """Client: opens the stream. Without it the first frame opens the stream with the defaults."""
+
+    type: Literal["start"] = "start"
+    mode: Mode = "latest"
+    detector: Literal["candidates"] = "candidates"
+    horizon: Annotated[float, Field(gt=0.0, lt=1.0)] | None = Field(
+        default=None, description="Row of the horizon as a share of the image height; estimated where absent."
+    )
+
+
+class FrameMessage(Message):
+    """Client: numbers the binary message that follows. What is absent is assigned by the service."""
+
+    type: Literal["frame"] = "frame"
+    seq: Annotated[int, Field(ge=0)] | None = None
+    timestamp: Annotated[float, Field(allow_inf_nan=False)] | None = Field(
+        default=None, description="Capture time in seconds; any clock that does not go backwards."
+    )
+
+
+class EndMessage(Message):
+    """Client: no more frames; the service answers what it holds, then sends a summary and closes."""
+
+    type: Literal["end"] = "end"
+
+
+class Limits(Message):
+    """What the service accepts."""
+
+    max_bytes: int
+    max_pixels: int
+    credits: int = Field(description="Mode `all`: how many frames may be unanswered at a time.")
+
+
+class ReadyMessage(Message):
+    """Service: the stream is open."""
+
+    type: Literal["ready"] = "ready"
+    session: str
+    mode: Mode
+    detector: str
+    model: str
+    provider: str
+    limits: Limits
+
+
+class LineModel(Message):
+    """A boundary's end points: what a straight line between its lowest and its highest row would join."""
+
+    bottom: Point
+    top: Point
+
+
+class LaneModel(Message):
+    """One tracked boundary. x(y) = c0 + c1 (y - row) + c2 (y - row)^2 between the rows of `line`."""
+
+    track_id: int
+    position: int = Field(description="-1 ego left, +1 ego right, -2 and +2 the next ones out.")
+    state: Literal["detected", "predicted"]
+    probability: float
+    points: list[Point] = Field(description="From the lowest row to the highest.")
+    line: LineModel
+    row: float
+    coefficients: tuple[float, float, float]
+    covariance: list[list[float]] = Field(description="3 x 3, of the coefficients.")
+    age_s: float
+
+
+class EgoModel(Message):
+    """The lane the camera is in: its boundaries' track ids, and the camera's offset from the centre.
+
+    The offset is a share of the lane width, positive to the right; null unless both boundaries are known.
+    """
+
+    left: int | None
+    right: int | None
+    offset: float | None
+
+
+class LaneChangeModel(Message):
+    """The camera crossed a boundary."""
+
+    type: Literal["lane_change"] = "lane_change"
+    track_id: int
+    direction: Literal["left", "right"]
+
+
+class TimingModel(Message):
+    """Milliseconds by stage; `queue` is waiting, `total` runs from the frame's arrival to its reply."""
+
+    decode: float
+    propose: float
+    queue: float
+    infer: float
+    track: float
+    total: float
+
+
+class LanesMessage(Message):
+    """Service: the lanes of one frame."""
+
+    type: Literal["lanes"] = "lanes"
+    seq: int
+    timestamp: float
+    width: int
+    height: int
+    horizon: float
+    lanes: list[LaneModel]
+    ego: EgoModel
+    events: list[LaneChangeModel]
+    dropped: int = Field(description="Frames of this stream that were never processed, so far.")
+    timing_ms: TimingModel
+
+
+class ErrorMessage(Message):
+    """Service: something was wrong. A frame's error costs that frame; a fatal one ends the stream."""
+
+    type: Literal["error"] = "error"
+    code: str
+    message: str
+    hint: str = ""
+    seq: int | None = None
+    fatal: bool = False
+
+
+class SummaryMessage(Message):
+    """Service: the answer to `end`; `frames` counts received ones, each of them answered, failed or dropped."""
+
+    type: Literal["summary"] = "summary"
+    frames: int
+    answered: int
+    failed: int
+    dropped: int
+    duration_s: float
+
+
+ClientMessage = Annotated[StartMessage | FrameMessage | EndMessage, Field(discriminator="type")]
+ServerMessage = Annotated[
+    ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage, Field(discriminator="type")
+]
+
+_CLIENT: Final[TypeAdapter[StartMessage | FrameMessage | EndMessage]] = TypeAdapter(ClientMessage)
+_SERVER: Final[TypeAdapter[ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage]] = TypeAdapter(ServerMessage)
+
+
+def parse_client_message(text: str) -> StartMessage | FrameMessage | EndMessage:
+    """The client message in `text`. Raises ProtocolError with one line that says what was wrong."""
+    try:
+        return _CLIENT.validate_json(text)
+    except ValidationError as error:
+        raise ProtocolError(
+            f"not a stream message: {_first_problem(error)}",
+            'send a text message like {"type": "start"|"frame"|"end", ...} or a binary message with an image file',
+        ) from None
+
+
+def parse_server_message(text: str) -> ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage:
+    """The service message in `text`. Raises ProtocolError where it is none."""
+    try:
+        return _SERVER.validate_json(text)
+    except ValidationError as error:
+        raise ProtocolError(f"the service sent something unknown: {_first_problem(error)}") from None
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors(include_url=False, include_input=False)[0]
+    where = ".".join(str(part) for part in problem["loc"])
+    return f"{where}: {problem['msg']}" if where else problem["msg"]
