@@ -1,1 +1,3 @@
 """Lanestream: camera frames in, tracked lane lines out."""
+
+__version__ = "0.1.0"

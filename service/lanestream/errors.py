@@ -5,6 +5,7 @@ A message says what was wrong; a hint says what is accepted or what to do. Both 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -68,6 +69,18 @@ class BusyError(LanestreamError):
     code = "busy"
 
 
+class NotReadyError(LanestreamError):
+    """The service has not loaded its network yet."""
+
+    code = "not_ready"
+
+
+class NotAcceptableError(LanestreamError):
+    """A request for an answer in a form that the service does not speak."""
+
+    code = "not_acceptable"
+
+
 class SettingsError(LanestreamError):
     """A setting, or a command line, with a value that is not accepted."""
 
@@ -125,9 +138,25 @@ _ANSWERS: Final[dict[str, Answer]] = {
     ProtocolError.code: Answer(422, 1002),
     OverrunError.code: Answer(429, 1008),
     BusyError.code: Answer(503, 1013),
+    NotReadyError.code: Answer(503, 1013),
+    NotAcceptableError.code: Answer(406, 1003),
 }
 
 
 def answer_to(error: BaseException) -> Answer:
     """How `error` is answered over HTTP and over a WebSocket."""
     return _ANSWERS.get(error.code, _INTERNAL) if isinstance(error, LanestreamError) else _INTERNAL
+
+
+def error_of(code: str, message: str, hint: str = "") -> LanestreamError:
+    """The error that the service told as `code`, of the class that has this code; of the root where none has."""
+    for kind in _kinds(LanestreamError):
+        if kind.code == code:
+            return kind(message, hint)
+    return LanestreamError(message, hint)
+
+
+def _kinds(root: type[LanestreamError]) -> Iterator[type[LanestreamError]]:
+    for kind in root.__subclasses__():
+        yield kind
+        yield from _kinds(kind)

@@ -30,13 +30,13 @@ class Scaling:
 
     def curve_to_image(self, curve: Curve) -> Curve:
         """A working curve, in image pixels."""
-        c0, c1, c2 = curve.coefficients
-        return Curve(self.to_image(curve.row), (self.to_image(c0), c1, c2 * self.factor))
+        v, b, k = curve.coefficients
+        return Curve(self.to_image(curve.horizon), (self.to_image(v), b, k / self.factor**2))
 
     def curve_to_working(self, curve: Curve) -> Curve:
         """An image curve, in working pixels."""
-        c0, c1, c2 = curve.coefficients
-        return Curve(self.to_working(curve.row), (self.to_working(c0), c1, c2 / self.factor))
+        v, b, k = curve.coefficients
+        return Curve(self.to_working(curve.horizon), (self.to_working(v), b, k * self.factor**2))
 
 
 @dataclass(frozen=True)

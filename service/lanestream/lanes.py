@@ -19,35 +19,41 @@ State = Literal["detected", "predicted"]
 
 @dataclass(frozen=True)
 class Curve:
-    """A boundary as x(y) = c0 + c1 (y - row) + c2 (y - row)^2, in pixels; a straight line has c2 = 0."""
+    """A boundary as x(y) = v + b u + k / u with u = y - horizon, in pixels; a straight line has k = 0.
 
-    row: float
+    On a flat road this is exactly a parabola of the ground seen in perspective: v is where it meets the horizon, b its
+    lateral place, k its bend. It is valid below the horizon; nearer than one row to it, u counts as one row.
+    """
+
+    horizon: float
     coefficients: tuple[float, float, float]
 
     @classmethod
-    def through(cls, rows: FloatArray, columns: FloatArray) -> Curve:
-        """The curve through three points at three different rows, its reference at the first of them."""
-        basis = np.vander(np.asarray(rows, dtype=float) - rows[0], 3, increasing=True)
-        c0, c1, c2 = np.linalg.solve(basis, columns)
-        return cls(float(rows[0]), (float(c0), float(c1), float(c2)))
+    def through(cls, horizon: float, rows: FloatArray, columns: FloatArray) -> Curve:
+        """The curve through three points at three different rows (3,) below `horizon`."""
+        v, b, k = np.linalg.solve(curve_basis(horizon, rows), columns)
+        return cls(horizon, (float(v), float(b), float(k)))
 
     def x(self, y: FloatArray | float) -> FloatArray:
         """Columns at the rows `y`; the shape of the answer is that of `y`."""
-        t = np.asarray(y, dtype=float) - self.row
-        c0, c1, c2 = self.coefficients
-        columns: FloatArray = np.asarray(c0 + t * (c1 + t * c2))
-        return columns
+        v, b, k = self.coefficients
+        u = _depth(self.horizon, y)
+        return v + b * u + k / u
 
     def slope(self, y: FloatArray | float) -> FloatArray:
         """dx/dy at the rows `y`."""
-        slopes: FloatArray = np.asarray(self.coefficients[1] + 2.0 * self.coefficients[2] * (np.asarray(y) - self.row))
-        return slopes
+        _, b, k = self.coefficients
+        return b - k / _depth(self.horizon, y) ** 2
 
-    def moved_to(self, row: float) -> Curve:
-        """The same curve, told from another reference row."""
-        c0, c1, c2 = self.coefficients
-        t = row - self.row
-        return Curve(row, (c0 + t * (c1 + t * c2), c1 + 2.0 * c2 * t, c2))
+
+def curve_basis(horizon: float, rows: FloatArray) -> FloatArray:
+    """d x / d (v, b, k) at `rows` (N,): shape (N, 3)."""
+    u = _depth(horizon, rows)
+    return np.stack([np.ones_like(u), u, 1.0 / u], axis=-1)
+
+
+def _depth(horizon: float, y: FloatArray | float) -> FloatArray:
+    return np.maximum(np.asarray(y, dtype=float) - horizon, 1.0)
 
 
 @dataclass(frozen=True)
@@ -70,7 +76,7 @@ class Candidate:
 class Detection:
     """A boundary found in one frame.
 
-    `covariance` (3, 3) belongs to the curve's coefficients at its reference row. `probability` is the calibrated chance
+    `covariance` (3, 3) belongs to the curve's coefficients. `probability` is the calibrated chance
     that this is a lane boundary.
     """
 

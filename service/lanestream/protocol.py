@@ -6,11 +6,11 @@ image that was sent (x right, y down, pixel centres at integers), timestamps are
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from lanestream.errors import ProtocolError
+from lanestream.errors import LanestreamError, ProtocolError
 
 SUBPROTOCOL: Final = "lanestream.v1"
 
@@ -79,7 +79,10 @@ class LineModel(Message):
 
 
 class LaneModel(Message):
-    """One tracked boundary. x(y) = c0 + c1 (y - row) + c2 (y - row)^2 between the rows of `line`."""
+    """One tracked boundary: x(y) = v + b u + k / u with u = y - horizon and `coefficients` [v, b, k].
+
+    It holds between the rows of `line`. On a flat road this is a parabola of the ground, seen in perspective.
+    """
 
     track_id: int
     position: int = Field(description="-1 ego left, +1 ego right, -2 and +2 the next ones out.")
@@ -87,7 +90,7 @@ class LaneModel(Message):
     probability: float
     points: list[Point] = Field(description="From the lowest row to the highest.")
     line: LineModel
-    row: float
+    horizon: float
     coefficients: tuple[float, float, float]
     covariance: list[list[float]] = Field(description="3 x 3, of the coefficients.")
     age_s: float
@@ -162,9 +165,7 @@ class SummaryMessage(Message):
 
 
 ClientMessage = Annotated[StartMessage | FrameMessage | EndMessage, Field(discriminator="type")]
-ServerMessage = Annotated[
-    ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage, Field(discriminator="type")
-]
+ServerMessage = Annotated[ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage, Field(discriminator="type")]
 
 _CLIENT: Final[TypeAdapter[StartMessage | FrameMessage | EndMessage]] = TypeAdapter(ClientMessage)
 _SERVER: Final[TypeAdapter[ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage]] = TypeAdapter(ServerMessage)
@@ -187,6 +188,20 @@ def parse_server_message(text: str) -> ReadyMessage | LanesMessage | ErrorMessag
         return _SERVER.validate_json(text)
     except ValidationError as error:
         raise ProtocolError(f"the service sent something unknown: {_first_problem(error)}") from None
+
+
+def error_message(error: BaseException, *, seq: int | None = None, fatal: bool = False) -> ErrorMessage:
+    """How `error` is told. Nothing of an error that was not raised on purpose is told: it is in the service's log."""
+    if isinstance(error, LanestreamError):
+        return ErrorMessage(code=error.code, message=error.message, hint=error.hint, seq=seq, fatal=fatal)
+    return ErrorMessage(
+        code=LanestreamError.code, message="something went wrong in the service", hint="see its log", seq=seq, fatal=fatal
+    )
+
+
+def schemas() -> dict[str, dict[str, Any]]:
+    """JSON Schemas of the messages that a client sends and of those that the service sends."""
+    return {"client": _CLIENT.json_schema(), "server": _SERVER.json_schema(mode="serialization")}
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -1,0 +1,121 @@
+"""AlexNet in PyTorch: torchvision's topology and key names, with batch normalisation beside it while it trains.
+
+Source: A. Krizhevsky, "One weird trick for parallelizing convolutional neural networks", 2014, the variant that
+torchvision ships. The normalisation layers live under their own keys (`norms.*`), so a torchvision checkpoint loads as
+it is, and folding them leaves exactly the plain network.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from lanestream.errors import CheckpointError
+
+INPUT_SIZE = 224
+
+# Added to a patch's contrast (1 is full scale), so that the noise of an empty patch is not blown up to a texture.
+LEAST_CONTRAST = 0.03
+
+_CONVOLUTIONS = (0, 3, 6, 8, 10)
+
+
+class AlexNet(nn.Module):
+    """The network for `classes` classes; `normalised` adds a batch normalisation after each convolution."""
+
+    def __init__(self, classes: int = 2, normalised: bool = True, dropout: float = 0.5) -> None:
+        super().__init__()
+        self.features = nn.Sequential(
+            nn.Conv2d(3, 64, 11, stride=4, padding=2),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2),
+            nn.Conv2d(64, 192, 5, padding=2),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2),
+            nn.Conv2d(192, 384, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(384, 256, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(256, 256, 3, padding=1),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2),
+        )
+        self.norms = nn.ModuleDict(
+            {str(i): nn.BatchNorm2d(self._convolution(i).out_channels) for i in _CONVOLUTIONS} if normalised else {}
+        )
+        self.classifier = nn.Sequential(
+            nn.Dropout(dropout),
+            nn.Linear(256 * 6 * 6, 4096),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Linear(4096, 4096),
+            nn.ReLU(),
+            nn.Linear(4096, classes),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Logits (N, classes) of normalised RGB images (N, 3, 224, 224)."""
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if str(index) in self.norms:
+                x = self.norms[str(index)](x)
+        logits: Tensor = self.classifier(torch.flatten(x, 1))
+        return logits
+
+    def _convolution(self, index: int) -> nn.Conv2d:
+        layer = self.features[index]
+        assert isinstance(layer, nn.Conv2d)  # noqa: S101 - tells mypy what the constructor above says
+        return layer
+
+    def folded(self) -> AlexNet:
+        """The same function as a plain AlexNet: each normalisation goes into the convolution before it."""
+        plain = AlexNet(self.classes, normalised=False)
+        plain.load_state_dict({k: v.clone() for k, v in self.state_dict().items() if not k.startswith("norms.")})
+        for key, norm in self.norms.items():
+            assert isinstance(norm, nn.BatchNorm2d)  # noqa: S101 - as above
+            mine = plain._convolution(int(key))
+            variance, mean = norm.running_var, norm.running_mean
+            assert variance is not None and mean is not None and mine.bias is not None  # noqa: S101, PT018
+            gain = norm.weight / torch.sqrt(variance + norm.eps)
+            mine.weight.data = mine.weight.data * gain[:, None, None, None]
+            mine.bias.data = (mine.bias.data - mean) * gain + norm.bias
+        return plain.eval()
+
+    @property
+    def classes(self) -> int:
+        """How many classes it tells apart."""
+        last = self.classifier[6]
+        assert isinstance(last, nn.Linear)  # noqa: S101 - as above
+        return last.out_features
+
+
+def normalise(patches: Tensor) -> Tensor:
+    """RGB patches (N, H, W, 3) uint8, as the network wants them: (N, 3, H, W) float, each about zero.
+
+    Each patch is measured against its own brightness and contrast, so that a road in the shadow looks like one in the
+    sun; the channels share both numbers, so that yellow stays yellow.
+    """
+    images = patches.permute(0, 3, 1, 2).float() / 255.0
+    centred = images - images.mean(dim=(1, 2, 3), keepdim=True)
+    deviation = torch.sqrt((centred * centred).mean(dim=(1, 2, 3), keepdim=True))
+    return centred / (deviation + LEAST_CONTRAST)
+
+
+def initialise(network: AlexNet, weights: Path) -> None:
+    """Takes over the convolutions and hidden layers of a torchvision AlexNet checkpoint; the last layer stays new.
+
+    Raises CheckpointError where the file is not one.
+    """
+    try:
+        state = torch.load(weights, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load raises half a dozen types for a file that is not a checkpoint
+        raise CheckpointError(f"{weights} is not a PyTorch checkpoint: {error}", "give a state_dict file") from error
+    if not isinstance(state, dict):
+        raise CheckpointError(f"{weights} holds a {type(state).__name__}", "give a state_dict file")
+    wanted = {k: v for k, v in network.state_dict().items() if not k.startswith(("norms.", "classifier.6."))}
+    wrong = [key for key, value in wanted.items() if key not in state or state[key].shape != value.shape]
+    if wrong:
+        raise CheckpointError(f"{weights} lacks {wrong[0]} of a torchvision AlexNet", "give alexnet weights")
+    network.load_state_dict({key: state[key] for key in wanted}, strict=False)

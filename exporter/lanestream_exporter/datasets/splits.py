@@ -1,0 +1,60 @@
+"""Which real frames may be trained on, which choose and calibrate, and which are for reporting alone."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from lanestream.errors import LabelError
+from lanestream.lanes import Image
+from lanestream_exporter.datasets.clips import read_clip, read_clip_labels
+from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.tusimple import read_tusimple
+
+Split = Literal["train", "val", "test"]
+
+_CLIPS: dict[Split, tuple[str, ...]] = {
+    "train": ("highway_project_8s", "highway_concrete"),
+    "val": (),
+    "test": ("highway_white_right",),
+}
+
+# The country road is one drive: cut by time, with the stretch between two parts left out of neither but never shared.
+_COUNTRY_FRAMES: dict[Split, range] = {"train": range(0, 2000), "val": range(2000, 2400), "test": range(2400, 2800)}
+
+
+def data_root() -> Path:
+    """The folder of real frames: `$LANESTREAM_DATA`, else `../shared/data` beside the project.
+
+    Raises LabelError where there is none.
+    """
+    root = Path(os.environ.get("LANESTREAM_DATA", "../shared/data"))
+    if not (root / "tusimple" / "labels.jsonl").is_file():
+        raise LabelError(f"no labelled frames in {root}", "set LANESTREAM_DATA to the data folder")
+    return root
+
+
+def real_frames(root: Path, split: Split) -> Iterator[tuple[LabelledFrame, Image]]:
+    """All labelled real frames of a split with their BGR images, drive after drive."""
+    yield from read_tusimple(root / "tusimple", split)
+    for clip in _CLIPS[split]:
+        yield from read_clip(root / "udacity/clips" / f"{clip}.mp4", root / "udacity/labels" / f"{clip}.jsonl")
+    yield from _country_frames(root / "udacity_ch2", _COUNTRY_FRAMES[split])
+
+
+def _country_frames(root: Path, wanted: range) -> Iterator[tuple[LabelledFrame, Image]]:
+    """Labelled frames of the country road from the original JPEGs, which the video has compressed once more."""
+    labels = root / "labels.jsonl"
+    images = {int(r["frame"]): str(r["image"]) for r in map(json.loads, labels.read_text().splitlines())}
+    for index, frame in read_clip_labels(labels, exhaustive=True).items():
+        if index in wanted:
+            image = cv2.imread(str(root / images[index]))
+            if image is None:
+                raise LabelError(f"{labels}: {images[index]} can't be read as an image")
+            yield frame, np.asarray(image, dtype=np.uint8)

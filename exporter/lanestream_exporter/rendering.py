@@ -1,0 +1,80 @@
+"""Patches of rendered scenes and of real frames, made once and kept in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.geometry import RoadView
+from lanestream_exporter.datasets.splits import Split, real_frames
+from lanestream_exporter.patches import PatchMaker
+from lanestream_exporter.patchstore import write_store
+from lanestream_exporter.scenes import render_still, sample_scene
+
+SCENES_PER_FILE = 250
+
+# Sizes of rendered stills and how often each is drawn: cameras differ, and so does how sharp a strip is.
+_SIZES = ((640, 360), (640, 480), (960, 540), (1280, 720))
+_SHARES = (0.4, 0.2, 0.25, 0.15)
+
+
+def rendered_stores(folder: Path, files: int, workers: int, done: Callable[[Path], None]) -> list[Path]:
+    """`files` files of patches from `SCENES_PER_FILE` scenes each, numbered by seed; those already there are kept.
+
+    `done` is called with each file as it is finished.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"rendered-{number:04d}.npz" for number in range(files)]
+    missing = [(number, path) for number, path in enumerate(paths) if not path.exists()]
+    # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        running = {pool.submit(_render_file, number, path): path for number, path in missing}
+        for future in as_completed(running):
+            future.result()
+            done(running[future])
+    return paths
+
+
+def real_store(folder: Path, root: Path, split: Split, rounds: int) -> Path:
+    """One file of patches from the labelled real frames of `split`; kept if it is already there.
+
+    Round 0 takes each frame's own candidates, every further one candidates beside its labels as well.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"real-{split}.npz"
+    if not path.exists():
+        write_store(path, _real_patches(root, split, rounds))
+    return path
+
+
+def _render_file(number: int, path: Path) -> None:
+    cv2.setNumThreads(1)
+    write_store(path, _rendered_patches(number))
+
+
+def _rendered_patches(number: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
+    maker = PatchMaker()
+    for index in range(SCENES_PER_FILE):
+        rng = np.random.default_rng([number, index])
+        width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
+        still = render_still(sample_scene(rng, width, height))
+        view = RoadView(width, height, still.horizon)
+        yield from maker.all_of(still.image, still.labels, view, rng)
+
+
+def _real_patches(root: Path, split: Split, rounds: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
+    maker = PatchMaker()
+    clear = partial(filter, lambda item: item[1] in (0, 1))
+    for number, (frame, image) in enumerate(real_frames(root, split)):
+        rng = np.random.default_rng([number, 1])
+        proposals = maker.search.propose(image)
+        yield from clear(zip(*maker.proposed(image, frame), strict=True))
+        for _ in range(rounds):
+            yield from clear(zip(*maker.jittered(image, frame, proposals.view, rng), strict=True))

@@ -1,0 +1,91 @@
+"""The picture under way, and drawing lit, hazy shapes into it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lanestream_exporter.scenes.camera import FloatArray
+    from lanestream_exporter.scenes.light import Air, Light
+    from lanestream_exporter.scenes.surface import Colour
+    from lanestream_exporter.scenes.view import RoadView
+
+Image = NDArray[np.uint8]
+
+SUBPIXEL_BITS = 4
+FARTHEST_PIXEL = 20_000.0  # polygons are clamped to this, far outside any picture, to stay within OpenCV's range
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The picture (H, W, 3) uint8 and the mask (H, W) of what hides the road for good: walls, trees, houses."""
+
+    image: Image
+    hidden: Image
+    view: RoadView
+    light: Light
+    air: Air
+
+    def tone(self, color: Colour, x: float, y: float) -> tuple[float, float, float]:
+        """Displayed colour, 0 to 255, of a thing at vehicle-frame (x, y)."""
+        level = self.light.level(x, y)
+        clear = self.air.clearness(x)
+        blue, green, red = (
+            255.0 * min(1.0, part * level * clear + mist * (1.0 - clear))
+            for part, mist in zip(color, self.air.color, strict=True)
+        )
+        return blue, green, red
+
+    def polygon(self, points: FloatArray, tone: tuple[float, float, float], *, hides: bool = False) -> None:
+        """Fills a polygon (N, 2) of image pixels; `hides` also marks the road behind it as hidden."""
+        fixed = fixed_point(points)
+        cv2.fillPoly(self.image, [fixed], tone, cv2.LINE_AA, SUBPIXEL_BITS)
+        if hides:
+            cv2.fillPoly(self.hidden, [fixed], (255.0,), cv2.LINE_8, SUBPIXEL_BITS)
+
+    def blend(self, patch: NDArray[np.float32], alpha: NDArray[np.float32], left: int, top: int) -> None:
+        """Blends a patch (h, w, 3), 0 to 255, over the picture at (left, top), cut at the picture's border."""
+        rows, columns = (
+            overlap(top, patch.shape[0], self.image.shape[0]),
+            overlap(left, patch.shape[1], self.image.shape[1]),
+        )
+        inside = (slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left))
+        region = self.image[rows, columns]
+        if region.size:
+            mixed = region + alpha[inside][..., None] * (patch[inside] - region)
+            region[...] = mixed.astype(np.uint8)
+
+    def darken(self, points: FloatArray, depth: float, softness: float) -> None:
+        """Takes the share `depth` of light from a polygon, with edges blurred over `softness` pixels."""
+        margin = 2.0 * softness + 2.0
+        low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+        height, width = self.image.shape[:2]
+        left, top = (int(np.clip(low[i], 0, limit)) for i, limit in ((0, width), (1, height)))
+        right, bottom = (int(np.clip(high[i], 0, limit)) for i, limit in ((0, width), (1, height)))
+        if right - left < 2 or bottom - top < 2:
+            return
+        mask = np.zeros((bottom - top, right - left), np.uint8)
+        cv2.fillPoly(mask, [fixed_point(points - (left, top))], (255.0,), cv2.LINE_AA, SUBPIXEL_BITS)
+        if softness > 0.4:
+            mask = np.asarray(cv2.GaussianBlur(mask, (0, 0), softness), dtype=np.uint8)
+        region = self.image[top:bottom, left:right]
+        region[...] = (region * (1.0 - np.float32(depth / 255.0) * mask[..., None])).astype(np.uint8)
+
+
+def overlap(start: int, length: int, limit: int) -> slice:
+    """The part of [start, start + length) that lies in [0, limit)."""
+    first = min(max(start, 0), limit)
+    return slice(first, max(first, min(start + length, limit)))
+
+
+def fixed_point(points: FloatArray | Sequence[Sequence[float]]) -> NDArray[np.int32]:
+    """Points in the fixed-point form of OpenCV's drawing calls with SUBPIXEL_BITS."""
+    clamped = np.clip(np.asarray(points), -FARTHEST_PIXEL, FARTHEST_PIXEL)
+    return np.asarray(np.round(clamped * (1 << SUBPIXEL_BITS)), dtype=np.int32)

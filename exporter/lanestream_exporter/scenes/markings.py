@@ -1,0 +1,221 @@
+"""Paint and dots on the lane boundaries, and marks on the road that are no boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from lanestream_exporter.scenes.noise import noise_tiles, sample
+from lanestream_exporter.scenes.view import Band, Grid, Layer, coverage, pulse
+
+if TYPE_CHECKING:
+    from lanestream_exporter.scenes.road import Marking, Road
+    from lanestream_exporter.scenes.surface import Colour
+
+DOT_RISE = 0.02  # metres a dot stands out of the road
+STENCIL_SCALE = 50.0  # pixels of a stencil's mask a metre
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """What is left of an older marking: grey, thin, off the present boundary. Not a lane boundary."""
+
+    u: float
+    marking: Marking
+    slant: float  # metres it moves to the left per metre of road
+    tone: float  # brightness, 0 to 1
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """A mark inside a lane: a word or an arrow, drawn out along the road so that drivers can read it."""
+
+    text: str  # a word in capitals, or one of "^", "<", ">" for an arrow ahead, left, right
+    s: float  # of its lower end, metres
+    u: float  # of its middle
+    length: float
+    width: float
+    brightness: float
+    wear: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Bars across the road: a stop line, the bars of a crossing, rumble strips. Metres."""
+
+    s: float
+    length: float  # along the road
+    low: float
+    high: float
+    period: float  # across the road; 0 for one unbroken bar
+    bar: float  # width of each bar across the road
+    brightness: float
+    wear: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Paintwork:
+    """Everything painted on the road that is no lane boundary."""
+
+    ghosts: tuple[Ghost, ...] = ()
+    stencils: tuple[Stencil, ...] = ()
+    bars: tuple[Bars, ...] = ()
+
+
+def paint_colour(marking: Marking) -> Colour:
+    """Blue, green, red of a marking in full daylight."""
+    shade = marking.brightness
+    if marking.color == "white":
+        return (0.97 * shade, shade, 0.99 * shade)
+    return (0.28 * shade, 0.78 * shade, shade)
+
+
+def paint_boundaries(grid: Grid, road: Road, ground: Layer) -> None:
+    """Paints every marked boundary into the unlit ground."""
+    for boundary in road.boundaries:
+        if boundary.marking:
+            band = _around(grid, boundary.u, boundary.marking)
+            _blend(ground, band, marking_cover(band, boundary.u, boundary.marking), paint_colour(boundary.marking))
+
+
+def paint_others(grid: Grid, paintwork: Paintwork, ground: Layer) -> None:
+    """Paints ghosts, stencils and bars into the unlit ground."""
+    view = grid.view
+    for ghost in paintwork.ghosts:
+        reach = 0.3 + abs(ghost.slant) * 60.0
+        band = grid.band(ghost.u - reach, ghost.u + reach)
+        straightened = Band(
+            band.index,
+            band.u - np.float32(ghost.slant) * (band.s - np.float32(grid.view.s[0])),
+            band.s,
+            band.across,
+            band.along,
+            band.distance,
+        )
+        cover = marking_cover(straightened, ghost.u, ghost.marking)
+        _blend(ground, band, cover, (ghost.tone, ghost.tone, ghost.tone))
+    for stencil in paintwork.stencils:
+        if view.spans(stencil.s, stencil.s + stencil.length):
+            _paint_stencil(grid, stencil, ground)
+    for bars in paintwork.bars:
+        if view.spans(bars.s, bars.s + bars.length):
+            _paint_bars(grid, bars, ground)
+
+
+def marking_cover(band: Band, u: float, marking: Marking) -> Layer:
+    """Share of each pixel of the band that paint covers, (N,)."""
+    offset = band.u - np.float32(u)
+    s = band.s - np.float32(marking.phase)
+    if marking.kind == "botts":
+        return _dots(band, offset, s, marking)
+    if marking.kind == "double":
+        half = np.float32((marking.gap + marking.width) / 2.0)
+        stripes = []
+        for name, side in (("left", half), ("right", -half)):
+            stripe = coverage(offset - side, marking.width, band.across)
+            broken = marking.broken == name
+            stripes.append(stripe * pulse(s, marking.period, marking.dash, band.along) if broken else stripe)
+        cover = stripes[0] + stripes[1]
+    else:
+        cover = coverage(offset, marking.width, band.across)
+        if marking.kind == "dashed":
+            cover *= pulse(s, marking.period, marking.dash, band.along)
+    return cover * _left_over(band, marking.wear, marking.seed)
+
+
+def _around(grid: Grid, u: float, marking: Marking) -> Band:
+    """The pixels a marking may touch: its stripes, and what a far pixel covers."""
+    reach = 1.5 * marking.width + marking.gap + 0.1
+    return grid.band(u - reach, u + reach)
+
+
+def _dots(band: Band, offset: Layer, s: Layer, marking: Marking) -> Layer:
+    """Groups of raised dots. Seen flatly they show their side, which lengthens them on the ground."""
+    spacing = marking.dash / (marking.dots - 1) if marking.dots > 1 else marking.period
+    rise = np.float32(DOT_RISE * 0.7) * band.distance
+    length = np.float32(marking.width) + np.minimum(rise, np.float32(0.4 * spacing))
+    within = np.mod(s, np.float32(marking.period))
+    nearest = np.clip(np.round(within / spacing), 0, marking.dots - 1) * np.float32(spacing)
+    cover = coverage((within - nearest).astype(np.float32), length.astype(np.float32), np.maximum(band.along, 0.01))
+    cover *= coverage(offset, marking.width, band.across)
+    keep = np.random.default_rng(marking.seed).random(64) >= marking.wear
+    group = np.floor(s / np.float32(marking.period)) * marking.dots + nearest / np.float32(spacing)
+    return np.asarray(cover * keep[np.round(group).astype(np.int64) % 64], dtype=np.float32)
+
+
+def _left_over(band: Band, wear: float, seed: int) -> Layer:
+    """Share of paint left, (N,): chipped where noise at two scales falls below the wear."""
+    if wear <= 0.0:
+        return np.ones_like(band.u)
+    tiles = noise_tiles()
+    noise = sample(tiles.cloud, band.u, band.s, (0.012, 0.05), seed)
+    noise += 0.6 * sample(tiles.fine, band.u, band.s, (0.012, 0.02), seed + 1)
+    # A far pixel averages over many chips, so its noise shrinks towards the mean.
+    fade = np.minimum(1.0, 0.15 / np.maximum(np.maximum(band.across, band.along), 1e-3)).astype(np.float32)
+    threshold = np.float32(-2.2 + 3.6 * wear)
+    soft = np.clip((noise * fade - threshold) / (0.35 + 1.5 * (1.0 - fade)), 0.0, 1.0)
+    return np.asarray(soft * np.float32(1.0 - 0.35 * wear), dtype=np.float32)
+
+
+def _blend(ground: Layer, band: Band, cover: Layer, color: Colour) -> None:
+    flat = ground.reshape(-1, 3)
+    cover = np.clip(cover, 0.0, 1.0)[:, None]
+    here = flat[band.index]
+    flat[band.index] = here + cover * (np.array(color, np.float32) - here)
+
+
+def _paint_stencil(grid: Grid, stencil: Stencil, ground: Layer) -> None:
+    band = grid.band(stencil.u - stencil.width / 2.0, stencil.u + stencil.width / 2.0)
+    near = (band.s >= stencil.s) & (band.s <= stencil.s + stencil.length)
+    if not near.any():
+        return
+    band = Band(*(values[near] for values in vars(band).values()))
+    mask = stencil_mask(stencil.text)
+    rows, columns = mask.shape
+    right = (np.float32(stencil.u + stencil.width / 2.0) - band.u) * np.float32(columns / stencil.width)
+    down = (np.float32(stencil.s + stencil.length) - band.s) * np.float32(rows / stencil.length)
+    cover = cv2.remap(mask, right[None], down[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[0]
+    shade = stencil.brightness
+    _blend(ground, band, cover * _left_over(band, stencil.wear, stencil.seed), (shade, shade, shade))
+
+
+def stencil_mask(text: str) -> Layer:
+    """The outline of a word or arrow as a mask 0 to 1, top of the mask farthest along the road."""
+    size = round(2.4 * STENCIL_SCALE)
+    mask = np.zeros((size, size), np.uint8)
+    if text in {"^", "<", ">"}:
+        shaft = [(0.44, 1.0), (0.44, 0.35), (0.56, 0.35), (0.56, 1.0)]
+        head = {
+            "^": [(0.25, 0.38), (0.5, 0.0), (0.75, 0.38)],
+            "<": [(0.56, 0.3), (0.56, 0.42), (0.3, 0.42), (0.3, 0.55), (0.05, 0.35), (0.3, 0.15), (0.3, 0.3)],
+            ">": [(0.44, 0.3), (0.44, 0.42), (0.7, 0.42), (0.7, 0.55), (0.95, 0.35), (0.7, 0.15), (0.7, 0.3)],
+        }[text]
+        for outline in (shaft, head):
+            cv2.fillPoly(mask, [(np.array(outline) * (size - 1)).astype(np.int32)], (255,), cv2.LINE_AA)
+    else:
+        scale, thickness = 3.0, 14
+        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
+        word = np.zeros((height + thickness, width + thickness), np.uint8)
+        origin = (thickness // 2, height + thickness // 2)
+        cv2.putText(word, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness, cv2.LINE_AA)
+        cv2.resize(word, (size, size), mask, interpolation=cv2.INTER_AREA)
+    return np.asarray(mask, dtype=np.float32) / np.float32(255.0)
+
+
+def _paint_bars(grid: Grid, bars: Bars, ground: Layer) -> None:
+    band = grid.band(bars.low, bars.high)
+    near = np.abs(band.s - np.float32(bars.s + bars.length / 2.0)) < bars.length / 2.0 + 1.0
+    if not near.any():
+        return
+    band = Band(*(values[near] for values in vars(band).values()))
+    cover = coverage(band.s - np.float32(bars.s + bars.length / 2.0), bars.length, band.along)
+    if bars.period > 0.0:
+        cover *= pulse(band.u - np.float32(bars.low), bars.period, bars.bar, band.across)
+    cover *= (band.u > bars.low) & (band.u < bars.high)
+    shade = bars.brightness
+    _blend(ground, band, cover * _left_over(band, bars.wear, bars.seed), (shade, shade, shade))

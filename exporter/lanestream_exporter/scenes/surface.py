@@ -1,0 +1,191 @@
+"""The ground without paint: materials side by side, worn tracks, joints, seams, cracks and patches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lanestream_exporter.scenes.noise import ground_noise, noise_tiles, sample
+from lanestream_exporter.scenes.view import Grid, Layer, coverage, pulse
+
+if TYPE_CHECKING:
+    from lanestream_exporter.scenes.camera import FloatArray
+
+Colour = tuple[float, float, float]  # blue, green, red, each 0 to 1 as displayed
+
+PROFILE_REACH = 60.0  # metres to either side that the lateral profile covers
+PROFILE_STEP = 0.02  # metres
+
+
+@dataclass(frozen=True)
+class Material:
+    """A stretch of one material across the road, from u = low to u = high in metres."""
+
+    low: float
+    high: float
+    color: Colour
+    roughness: float  # strength of its blotches relative to asphalt
+
+
+@dataclass(frozen=True)
+class Track:
+    """A soft darker (or, below zero, lighter) band along the road: tyre polish, oil, dust."""
+
+    u: float
+    width: float  # one deviation, metres
+    depth: float
+
+
+@dataclass(frozen=True)
+class Seam:
+    """A thin line along the road: a sawn joint, a tar seam, a pavement edge. Never a lane boundary."""
+
+    u: float
+    width: float  # metres
+    depth: float  # share of light it takes away; below zero it is lighter than its surroundings
+    wander: float = 0.0  # metres of sideways wander
+    breaks: float = 0.0  # 0 for an unbroken line, 1 for mostly gaps
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Lines across the road from u = low to u = high, every `period` metres."""
+
+    low: float
+    high: float
+    period: float
+    width: float
+    depth: float
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A rectangle of other pavement: a repair, a bridge deck, a change from asphalt to concrete. Metres."""
+
+    s: float
+    length: float
+    low: float
+    high: float
+    gain: float  # of brightness
+    rim: float  # darkness of the sealed joint around it, 0 for none
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Everything that lies on the ground and isn't paint."""
+
+    materials: tuple[Material, ...]  # later ones lie on top
+    tracks: tuple[Track, ...] = ()
+    seams: tuple[Seam, ...] = ()
+    joints: tuple[Joint, ...] = ()
+    patches: tuple[Patch, ...] = ()
+    grain: float = 0.04  # strength of the aggregate
+    mottle: float = 0.05  # strength of blotches
+    streaks: float = 0.04  # strength of marks along the direction of travel
+    cracks: float = 0.0  # 0 for none
+    seed: int = 0
+
+
+def paint_ground(grid: Grid, surface: Surface) -> Layer:
+    """The unlit ground, (rows, width, 3) in blue, green, red, 0 to 1."""
+    colours, roughness = _profile(surface)
+    last = len(colours) - 1
+    index = ((grid.u + np.float32(PROFILE_REACH)) * np.float32(1.0 / PROFILE_STEP)).astype(np.int32)
+    np.clip(index, 0, last, out=index)
+    ground = np.take(colours, index, axis=0)
+    gain = _texture(grid, surface, np.take(roughness, index)) + np.float32(1.0)
+    if surface.cracks > 0.0:
+        gain *= _cracks(grid, surface)
+    _lay_patches(grid, surface, gain)
+    _draw_joints(grid, surface, gain)
+    _draw_seams(grid, surface, gain)
+    ground *= np.maximum(gain, 0.05)[..., None]
+    return np.asarray(ground, dtype=np.float32)
+
+
+def _profile(surface: Surface) -> tuple[Layer, Layer]:
+    """Colour (N, 3) and roughness (N,) by lateral position."""
+    u: FloatArray = np.arange(-PROFILE_REACH, PROFILE_REACH, PROFILE_STEP)
+    colours = np.zeros((len(u), 3), np.float32)
+    roughness = np.ones(len(u), np.float32)
+    for material in surface.materials:
+        inside = slice(*np.searchsorted(u, (material.low, material.high)))
+        colours[inside] = material.color
+        roughness[inside] = material.roughness
+    gain = np.ones(len(u))
+    for track in surface.tracks:
+        gain -= track.depth * np.exp(-0.5 * ((u - track.u) / track.width) ** 2)
+    colours *= gain[:, None].astype(np.float32)
+    return colours, roughness
+
+
+def _texture(grid: Grid, surface: Surface, roughness: Layer) -> Layer:
+    """Light and dark of the ground, zero mean. Rough ground has more of it, but no marks of tyres."""
+    tiles = noise_tiles()
+    texture = ground_noise(tiles.cloud, grid, (0.035, 0.05), surface.seed)
+    texture *= np.float32(surface.mottle)
+    near = int(np.argmax(np.append(grid.x < 16.0, True)))
+    if near < len(grid.x):
+        fine = sample(tiles.fine, grid.u[near:], grid.s[near:], (0.009, 0.012), surface.seed + 2)
+        fine *= np.clip((16.0 - grid.x[near:]) / 8.0, 0.0, 1.0)[:, None]
+        texture[near:] += np.float32(surface.grain) * fine
+    texture *= roughness
+    streaks = ground_noise(tiles.cloud, grid, (0.03, 0.9), surface.seed + 1)
+    streaks *= np.float32(surface.streaks) / np.square(roughness)
+    texture += streaks
+    return texture
+
+
+def _cracks(grid: Grid, surface: Surface) -> Layer:
+    """A gain with dark lines where smooth noise crosses zero: closed, wandering curves, as cracks are."""
+    noise = sample(noise_tiles().cloud, grid.u, grid.s, (0.06, 0.16), surface.seed + 3)
+    footprint = np.maximum(0.012, grid.along * 0.35)[:, None]
+    depth = np.minimum(1.0, 0.02 / footprint) * surface.cracks
+    lines = np.maximum(0.0, 1.0 - np.abs(noise) / (3.0 * footprint))
+    return np.asarray(1.0 - depth * lines, dtype=np.float32)
+
+
+def _lay_patches(grid: Grid, surface: Surface, gain: Layer) -> None:
+    flat = gain.reshape(-1)
+    for patch in surface.patches:
+        if not grid.view.spans(patch.s, patch.s + patch.length):
+            continue
+        band = grid.band(patch.low, patch.high)
+        middle = np.float32(patch.s + patch.length / 2.0)
+        inside = coverage(band.s - middle, patch.length, band.along)
+        centre = np.float32((patch.low + patch.high) / 2.0)
+        sideways = coverage(band.u - centre, patch.high - patch.low, band.across)
+        inside *= sideways
+        flat[band.index] *= 1.0 + np.float32(patch.gain - 1.0) * inside
+        if patch.rim > 0.0:
+            core = coverage(band.s - middle, patch.length - 0.08, band.along)
+            core *= coverage(band.u - centre, patch.high - patch.low - 0.08, band.across)
+            flat[band.index] *= 1.0 - np.float32(patch.rim) * (inside - core)
+
+
+def _draw_joints(grid: Grid, surface: Surface, gain: Layer) -> None:
+    flat = gain.reshape(-1)
+    for joint in surface.joints:
+        band = grid.band(joint.low, joint.high)
+        inside = (band.u > joint.low) & (band.u < joint.high)
+        flat[band.index] *= 1.0 - np.float32(joint.depth) * inside * pulse(
+            band.s, joint.period, joint.width, band.along
+        )
+
+
+def _draw_seams(grid: Grid, surface: Surface, gain: Layer) -> None:
+    flat, cloud = gain.reshape(-1), noise_tiles().cloud
+    for seam in surface.seams:
+        reach = seam.width + 3.0 * seam.wander
+        band = grid.band(seam.u - reach, seam.u + reach)
+        offset = band.u - np.float32(seam.u)
+        if seam.wander > 0.0:
+            offset -= np.float32(seam.wander) * sample(cloud, np.zeros_like(band.s), band.s, (1.0, 0.12), seam.seed)
+        depth = coverage(offset, seam.width, band.across) * np.float32(seam.depth)
+        if seam.breaks > 0.0:
+            noise = sample(cloud, np.zeros_like(band.s), band.s, (1.0, 0.3), seam.seed + 1)
+            depth *= np.clip((noise + 1.5 - 3.0 * seam.breaks) * 4.0, 0.0, 1.0)
+        flat[band.index] *= 1.0 - depth

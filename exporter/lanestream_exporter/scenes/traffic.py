@@ -1,0 +1,186 @@
+"""Other vehicles: boxes with a cabin, windows, wheels, lights and a shadow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lanestream_exporter.scenes.camera import FloatArray
+    from lanestream_exporter.scenes.canvas import Canvas
+    from lanestream_exporter.scenes.surface import Colour
+
+NEAREST = 0.7  # metres ahead of the lens where vehicles are cut off
+VehicleKind = Literal["car", "van", "truck"]
+Point = tuple[float, float, float]  # shares of length (from the near end), width (from the right), height
+
+GLASS: Colour = (0.16, 0.14, 0.12)
+RUBBER: Colour = (0.05, 0.05, 0.05)
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A vehicle on the road, its near end at s and its middle at u. Metres, metres a second."""
+
+    kind: VehicleKind
+    s: float
+    u: float
+    speed: float  # along s; negative for one that comes towards us
+    length: float
+    width: float
+    height: float
+    color: Colour
+    braking: bool = False
+
+    @property
+    def oncoming(self) -> bool:
+        """Whether it shows its front."""
+        return self.speed < 0.0
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A vehicle being drawn: maps shares of its box to the image."""
+
+    canvas: Canvas
+    vehicle: Vehicle
+    x: float
+    y: float
+    nearest: float  # s where it is cut off, metres
+
+    def points(self, shares: Sequence[Point]) -> FloatArray:
+        along, across, up = np.array(shares, dtype=np.float64).T
+        car = self.vehicle
+        s = np.maximum(car.s + along * car.length, self.nearest)
+        return self.canvas.view.project(s, car.u + (across - 0.5) * car.width, up * car.height)
+
+    def fill(self, shares: Sequence[Point], color: Colour, gain: float = 1.0) -> None:
+        lit: Colour = (color[0] * gain, color[1] * gain, color[2] * gain)
+        self.canvas.polygon(self.points(shares), self.canvas.tone(lit, self.x, self.y))
+
+    def shine(self, shares: Sequence[Point], color: Colour) -> None:
+        """Fills a shape that gives its own light."""
+        self.canvas.polygon(self.points(shares), (255.0 * color[0], 255.0 * color[1], 255.0 * color[2]))
+
+
+def draw_vehicle(canvas: Canvas, vehicle: Vehicle) -> None:
+    """Draws one vehicle with its shadow, if its near end is ahead of the lens and in sight."""
+    nearest = canvas.view.here + NEAREST
+    ends = np.maximum([vehicle.s, vehicle.s + vehicle.length], nearest)
+    x, y = canvas.view.place(ends, np.full(2, vehicle.u))
+    if ends[1] < nearest + 1.0 or x.max() > canvas.view.reach:
+        return
+    box = _Box(canvas, vehicle, float(x[0]), float(y[0]), nearest)
+    outline = box.points([(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.0, 0.0, 1.0)])
+    if outline[:, 0].max() < -50.0 or outline[:, 0].min() > canvas.image.shape[1] + 50.0:
+        return
+    _draw_shadow(box)
+    side = _visible_side(box)
+    if vehicle.kind == "car":
+        _draw_car(box, side)
+    else:
+        _draw_tall(box, side)
+    _draw_lights(box)
+
+
+def _visible_side(box: _Box) -> float | None:
+    """1 where the left side faces the camera, 0 for the right, None for neither."""
+    for side, turn in ((0.0, 1.0), (1.0, -1.0)):
+        a, b, c = box.points([(0.0, side, 0.0), (1.0, side, 0.0), (1.0, side, 1.0)])
+        if turn * ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])) > 0.0:
+            return side
+    return None
+
+
+def _draw_shadow(box: _Box) -> None:
+    light = box.canvas.light
+    if light.headlights > 0.0:
+        return
+    lean = light.sun * box.vehicle.height / box.vehicle.width
+    low, high = min(0.0, lean) - 0.04, max(0.0, lean) + 1.04
+    ground = [(-0.06, low, 0.0), (-0.06, high, 0.0), (1.0, high, 0.0), (1.0, low, 0.0)]
+    width = box.canvas.view.camera.focal * 0.12 / box.x
+    box.canvas.darken(box.points(ground), 0.55, width)
+    under = [(-0.02, -0.02, 0.0), (-0.02, 1.02, 0.0), (0.98, 1.02, 0.0), (0.98, -0.02, 0.0)]
+    box.canvas.darken(box.points(under), 0.75, width)
+
+
+def _draw_wheels(box: _Box, side: float, positions: tuple[float, ...], radius: float) -> None:
+    angles = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+    car = box.vehicle
+    for wheel in positions:
+        for share, colour in ((1.0, RUBBER), (0.55, (0.3, 0.3, 0.3))):
+            size = radius * share
+            rim = [
+                (wheel + size * np.cos(a) / car.length, side, (radius + size * np.sin(a)) / car.height) for a in angles
+            ]
+            box.fill(rim, colour)
+
+
+def _draw_car(box: _Box, side: float | None) -> None:
+    colour = box.vehicle.color
+    if side is not None:
+        inner = 0.12 if side == 0.0 else 0.88
+        body = [(0.0, 0.2), (0.0, 0.6), (0.1, 0.64), (0.8, 0.62), (1.0, 0.5), (1.0, 0.2)]
+        box.fill([(a, side, b) for a, b in body], colour, 0.75)
+        _draw_wheels(box, side, (0.2, 0.8), 0.32)
+        cabin = [(0.06, side, 0.62), (0.2, inner, 0.98), (0.6, inner, 1.0), (0.8, side, 0.62)]
+        box.fill(cabin, colour, 0.7)
+        glass = [(0.14, side, 0.65), (0.24, inner, 0.93), (0.57, inner, 0.94), (0.72, side, 0.65)]
+        box.fill(glass, GLASS)
+    for wheel in (0.02, 0.78):
+        box.fill([(0.02, wheel, 0.0), (0.02, wheel + 0.2, 0.0), (0.02, wheel + 0.2, 0.3), (0.02, wheel, 0.3)], RUBBER)
+    box.fill([(0.2, 0.12, 0.98), (0.2, 0.88, 0.98), (0.6, 0.88, 1.0), (0.6, 0.12, 1.0)], colour, 1.1)
+    box.fill([(0.06, 0.03, 0.62), (0.2, 0.13, 0.99), (0.2, 0.87, 0.99), (0.06, 0.97, 0.62)], colour, 0.95)
+    box.fill([(0.08, 0.09, 0.66), (0.19, 0.16, 0.93), (0.19, 0.84, 0.93), (0.08, 0.91, 0.66)], GLASS)
+    box.fill([(0.0, 0.02, 0.6), (0.06, 0.04, 0.64), (0.06, 0.96, 0.64), (0.0, 0.98, 0.6)], colour, 1.15)
+    rear = [(0.02, 0.16), (0.0, 0.35), (0.02, 0.61), (0.98, 0.61), (1.0, 0.35), (0.98, 0.16)]
+    box.fill([(0.0, across, up) for across, up in rear], colour, 0.85)
+    box.fill([(0.0, 0.03, 0.14), (0.0, 0.03, 0.24), (0.0, 0.97, 0.24), (0.0, 0.97, 0.14)], colour, 0.45)
+    box.fill([(0.0, 0.4, 0.36), (0.0, 0.4, 0.45), (0.0, 0.6, 0.45), (0.0, 0.6, 0.36)], (0.7, 0.7, 0.7))
+
+
+def _draw_tall(box: _Box, side: float | None) -> None:
+    """A van or a truck: an upright box on wheels."""
+    colour, car = box.vehicle.color, box.vehicle
+    floor = 0.9 / car.height if car.kind == "truck" else 0.18
+    radius = 0.5 if car.kind == "truck" else 0.35
+    wheels = (0.12, 0.2, 0.85) if car.kind == "truck" else (0.2, 0.8)
+    if side is not None:
+        _draw_wheels(box, side, wheels, radius)
+        box.fill([(0.0, side, floor), (0.0, side, 1.0), (1.0, side, 1.0), (1.0, side, floor)], colour, 0.72)
+        box.fill([(0.0, side, floor), (0.0, side, floor + 0.04), (1.0, side, floor + 0.04), (1.0, side, floor)], RUBBER)
+        if car.kind == "van":
+            pane = [(0.1, side, 0.58), (0.1, side, 0.88), (0.85, side, 0.88), (0.85, side, 0.58)]
+            box.fill(pane, GLASS)
+    for wheel in (0.04, 0.72):
+        tyre = [(0.01, wheel, 0.0), (0.01, wheel + 0.24, 0.0), (0.01, wheel + 0.24, floor), (0.01, wheel, floor)]
+        box.fill(tyre, RUBBER)
+    box.fill([(0.0, 0.0, floor), (0.0, 0.0, 1.0), (0.0, 1.0, 1.0), (0.0, 1.0, floor)], colour, 0.95)
+    if car.kind == "van" or car.oncoming:
+        box.fill([(0.0, 0.08, 0.56), (0.0, 0.1, 0.88), (0.0, 0.9, 0.88), (0.0, 0.92, 0.56)], GLASS)
+    else:
+        box.fill([(0.0, 0.49, floor), (0.0, 0.49, 0.98), (0.0, 0.51, 0.98), (0.0, 0.51, floor)], colour, 0.6)
+        bar = 0.45 * floor
+        box.fill([(0.0, 0.04, bar), (0.0, 0.04, bar * 1.35), (0.0, 0.96, bar * 1.35), (0.0, 0.96, bar)], RUBBER)
+
+
+def _draw_lights(box: _Box) -> None:
+    car = box.vehicle
+    base = 0.42 if car.kind == "car" else 0.95 / car.height
+    size = 0.13 if car.kind == "car" else 0.05
+    night = box.canvas.light.glow < 0.4
+    for inner, outer in ((0.04, 0.2), (0.96, 0.8)):
+        lamp = [(0.0, inner, base), (0.0, inner, base + size), (0.0, outer, base + size), (0.0, outer, base)]
+        if car.oncoming:
+            glow: Colour = (1.0, 1.0, 1.0)
+        else:
+            glow = (0.15, 0.15, 0.95) if car.braking else (0.08, 0.08, 0.6)
+        if night or car.braking:
+            box.shine(lamp, glow)
+        else:
+            box.fill(lamp, glow, 0.9)

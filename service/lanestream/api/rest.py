@@ -1,0 +1,185 @@
+"""Single requests: lanes of one image, what the service is, and whether it can be used."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import AsyncGenerator
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import cv2
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+from starlette.datastructures import UploadFile
+from starlette.formparsers import MultiPartException, MultiPartParser
+from starlette.requests import ClientDisconnect
+
+from lanestream.api.accept import preferred
+from lanestream.api.service import Service
+from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
+from lanestream.messages import lanes_message
+from lanestream.protocol import LanesMessage, schemas
+
+if TYPE_CHECKING:
+    from lanestream.api.service import Draw
+    from lanestream.imaging import ImageLimits
+    from lanestream.messages import ProcessedFrame
+
+router = APIRouter()
+
+_JSON: Final = "application/json"
+_PICTURES: Final = {"image/jpeg": ".jpg", "image/png": ".png"}
+# What boundaries and part headers may add to the bytes of a multipart body's one file.
+_MULTIPART_EXTRA: Final = 1 << 16
+_BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
+_FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["schema"]}, "required": ["file"]}}
+
+
+class ModelInfo(BaseModel):
+    """A loaded network: its name and version, what runs it, and what its file says of itself."""
+
+    name: str
+    detector: str
+    provider: str
+    metadata: dict[str, Any]
+
+
+class ModelList(BaseModel):
+    """The networks of the service; the first is the default."""
+
+    models: list[ModelInfo]
+
+
+class Problem(BaseModel):
+    """What every refused request is answered with."""
+
+    code: str
+    message: str
+    hint: str
+
+
+_PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
+    406: {"model": Problem, "description": "No answer in the form that was asked for"},
+    413: {"model": Problem, "description": "More bytes or pixels than are accepted"},
+    415: {"model": Problem, "description": "Not an image, or a corrupt one"},
+    422: {"model": Problem, "description": "A malformed request"},
+    503: {"model": Problem, "description": "Not ready yet, or at the session limit"},
+}
+
+
+@router.post(
+    "/v1/detect",
+    response_model=LanesMessage,
+    responses={200: {"content": dict.fromkeys(_PICTURES, _BINARY)}, **_PROBLEMS},
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"image/jpeg": _BINARY, "image/png": _BINARY, "image/webp": _BINARY, "multipart/form-data": _FORM},
+        }
+    },
+)
+async def detect(
+    request: Request,
+    horizon: Annotated[
+        float | None, Query(gt=0.0, lt=1.0, description="Row of the horizon as a share of the image height.")
+    ] = None,
+) -> Response:
+    """The lanes of one image, sent as the body or as the file of a form; as JSON, or drawn on it by `Accept`."""
+    service = _service(request)
+    loaded = service.loaded
+    form = _answer_form(request, service.draw)
+    with service.sessions.opened(loaded.engine, horizon) as opened:
+        data = await _image_bytes(request, service.settings.image_limits)
+        frame = await loaded.runner.run(opened.session, data, timestamp=0.0, arrived=time.monotonic())
+    message = lanes_message(frame, seq=0, timestamp=0.0)
+    if form == _JSON or service.draw is None:
+        return Response(message.model_dump_json(), media_type=_JSON)
+    picture = await loaded.runner.work(_picture, service.draw, frame, message, form)
+    return Response(picture, media_type=form)
+
+
+@router.get("/v1/models", responses={503: _PROBLEMS[503]})
+async def models(request: Request) -> ModelList:
+    """The network that runs, and what really runs it."""
+    network = _service(request).loaded.engine.network
+    info = ModelInfo(
+        name=network.name, detector="candidates", provider=network.provider, metadata=dict(network.metadata)
+    )
+    return ModelList(models=[info])
+
+
+@router.get("/v1/schema")
+async def schema() -> dict[str, dict[str, Any]]:
+    """JSON Schemas of the messages of `/v1/stream`: what a client sends, and what the service sends."""
+    return schemas()
+
+
+@router.get("/healthz")
+async def healthz() -> dict[str, str]:
+    """Answers while the process lives."""
+    return {"status": "alive"}
+
+
+@router.get("/readyz", responses={503: _PROBLEMS[503]})
+async def readyz(request: Request) -> dict[str, str]:
+    """Answers once the network is loaded and warm."""
+    return {"status": "ready", "provider": _service(request).loaded.engine.network.provider}
+
+
+def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+def _answer_form(request: Request, draw: Draw | None) -> str:
+    offered = [_JSON, *_PICTURES] if draw is not None else [_JSON]
+    form = preferred(request.headers.get("accept", "*/*"), offered)
+    if form is None:
+        raise NotAcceptableError(f"no answer as {request.headers['accept']!r}", f"{', '.join(offered)} can be had")
+    return form
+
+
+def _picture(draw: Draw, frame: ProcessedFrame, message: LanesMessage, form: str) -> bytes:
+    _, encoded = cv2.imencode(_PICTURES[form], draw(frame.image, message))
+    return encoded.tobytes()
+
+
+async def _image_bytes(request: Request, limits: ImageLimits) -> bytes:
+    """The image file in the body; no more of the body is ever read than the limit allows."""
+    if request.headers.get("content-type", "").startswith("multipart/form-data"):
+        return await _form_file(request, limits)
+    return b"".join([chunk async for chunk in _limited(request, limits.max_bytes)])
+
+
+async def _form_file(request: Request, limits: ImageLimits) -> bytes:
+    body = _limited(request, limits.max_bytes + _MULTIPART_EXTRA)
+    parser = MultiPartParser(request.headers, body, max_files=1, max_fields=8)
+    parser.spool_max_size = limits.max_bytes + 1
+    try:
+        form = await parser.parse()
+    except MultiPartException as error:
+        raise ProtocolError(f"the form can't be read: {error.message}", "send the image as the field `file`") from None
+    try:
+        file = form.get("file")
+        if not isinstance(file, UploadFile):
+            raise ProtocolError("the form has no file named `file`", "curl -F file=@road.jpg")
+        return await file.read()
+    finally:
+        await form.close()
+
+
+async def _limited(request: Request, most: int) -> AsyncGenerator[bytes]:
+    declared = request.headers.get("content-length", "")
+    size = int(declared) if declared.isdecimal() else 0
+    if size <= most:
+        size = 0
+        try:
+            async for chunk in request.stream():
+                size += len(chunk)
+                if size > most:
+                    break
+                yield chunk
+        except ClientDisconnect:
+            raise ProtocolError("the client went away before the end of its request") from None
+    if size > most:
+        raise ImageTooLargeError(f"the request has more than the {most:,} bytes that are accepted", "send a smaller JPEG")

@@ -1,0 +1,87 @@
+"""Runs the application in this process: the listening socket, the loading of the network, the life of the server."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import errno
+import logging
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+import cv2
+import uvicorn
+from uvicorn.config import LOGGING_CONFIG
+
+from lanestream.api.app import create_app
+from lanestream.errors import SettingsError
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+    from lanestream.api.service import Draw
+    from lanestream.engine import Engine
+    from lanestream.settings import Settings
+
+_log = logging.getLogger(__name__)
+_BACKLOG: Final = 2048
+
+
+def serve(settings: Settings, load: Callable[[], Engine], draw: Draw | None = None) -> None:
+    """Serves until a signal ends it; `load` returns a warm engine and is called in a thread while the service lives.
+
+    Raises SettingsError where it can't listen, and what `load` raises.
+    """
+    # The pool of frame threads is the parallelism; OpenCV's own on top of it would have them fight for processors.
+    cv2.setNumThreads(settings.opencv_threads)
+    listener = listen(settings.host, settings.port)
+    app = create_app(None, settings, draw)
+    server = uvicorn.Server(server_config(app, settings))
+    with suppress(KeyboardInterrupt), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
+        runner.run(_serve(server, listener, app, load))
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket. Raises SettingsError where the address can't be had."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0][0]
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise SettingsError(f"port {port} on {host} is in use", "choose another with --port") from None
+        reason = (error.strerror or str(error)).lower()
+        raise SettingsError(f"can't listen on {host}, port {port}: {reason}", "see --host and --port") from None
+
+
+def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
+    """How uvicorn serves `app`: frames are JPEGs, so deflate would cost 20 times the work and save nothing."""
+    return uvicorn.Config(
+        app,
+        ws="websockets-sansio",
+        ws_max_size=settings.max_bytes,
+        ws_per_message_deflate=False,
+        log_config=_log_config(),
+    )
+
+
+async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
+    serving = asyncio.create_task(server.serve(sockets=[listener]))
+    host, port = listener.getsockname()[:2]
+    _log.info("listening on http://%s:%d, loading the network", f"[{host}]" if ":" in host else host, port)
+    try:
+        engine = await asyncio.to_thread(load)
+        app.state.service.install(engine)
+        _log.info("ready: %s on %s", engine.network.name, engine.network.provider)
+    except BaseException:
+        server.should_exit = True
+        await serving
+        raise
+    await serving
+
+
+def _log_config() -> dict[str, Any]:
+    config = copy.deepcopy(LOGGING_CONFIG)
+    config["loggers"]["lanestream"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
+    return config

@@ -1,0 +1,173 @@
+"""Candidates: the possible boundaries of one frame, from edges to a short list."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.detection.edges import WORKING_WIDTH, find_edges, paint_grey, resized
+from lanestream.detection.fan import Fan
+from lanestream.detection.hough import ExtendedHough, HoughLines
+from lanestream.detection.perspective import Perspective, PerspectiveSearch, find_ridges
+from lanestream.detection.vanishing import VanishingPointSearch
+from lanestream.geometry import RoadView, Scaling, visible_rows
+from lanestream.lanes import Candidate, Curve, Image
+
+# Candidates reach from the bottom up to this share of the depth below the horizon. Nearer to the horizon a lane is a few
+# pixels wide and every line looks like every other.
+TOP_SHARE = 0.1
+
+# The two rows, as shares of the depth, at which lines are told, compared and suppressed.
+_NEAR, _FAR = 1.0, 0.45
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """The candidates of a frame in image pixels, best first, the road view they were found in, and its evidence."""
+
+    candidates: tuple[Candidate, ...]
+    view: RoadView
+    weight: float
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line of the working image by its columns at the near and the far row."""
+
+    near: float
+    far: float
+    strength: float
+    width: float | None = None
+
+
+@dataclass(frozen=True)
+class CandidateSearch:
+    """How candidates are found: Hough lines and their pairs, lines of the fan, then suppression.
+
+    `limit` is the most candidates of a frame. Two edges are one marking where their distance is `least_width` to
+    `most_width` times the rows below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for
+    double lines). Candidates nearer than `separation` times the rows below the horizon, at two rows, are the same.
+    """
+
+    hough: ExtendedHough = ExtendedHough()
+    vanishing: VanishingPointSearch = VanishingPointSearch()
+    perspective: PerspectiveSearch = PerspectiveSearch()
+    fan: Fan = Fan()
+    limit: int = 16
+    least_width: float = 0.03
+    most_width: float = 0.4
+    separation: float = 0.05
+
+    def propose(self, image: Image, horizon: float | None = None) -> Proposals:
+        """The candidates of a BGR image (H, W, 3) uint8; `horizon` is its row where that is known."""
+        height, width = image.shape[:2]
+        scaling = Scaling(WORKING_WIDTH / width)
+        grey = resized(paint_grey(image), scaling)
+        point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon))
+        view = RoadView(grey.shape[1], grey.shape[0], point.y)
+        image_view = RoadView(width, height, scaling.to_image(point.y))
+        candidates: list[Candidate] = []
+        for line in self._suppress(self._ranked(grey, view, point, lines), view):
+            candidate = _candidate(line, scaling.curve_to_image(_curve(line, view, point)), image_view)
+            if candidate is not None and len(candidates) < self.limit:
+                candidates.append(candidate)
+        return Proposals(tuple(candidates), image_view, point.weight)
+
+    def _road(self, grey: Image, horizon: float | None) -> tuple[Perspective, HoughLines]:
+        """The perspective of the working image and the Hough lines of its road."""
+        height, width = grey.shape
+        top = int(horizon) if horizon is not None else int(0.42 * height)
+        lines = self.hough.lines(find_edges(grey, int(np.clip(top, 0, height - 16))), width, height - 1.0)
+        first = self.vanishing.find(lines, width, height, horizon)
+        guess = Perspective(first.x, first.y, 0.0, first.weight)
+        ridges = find_ridges(grey, guess.y)
+        return self.perspective.refine(guess, ridges, width, height - 1.0, horizon is not None), lines
+
+    def _ranked(self, grey: Image, view: RoadView, point: Perspective, lines: HoughLines) -> list[_Line]:
+        """Lines of both searches in one order: each list's strengths count against its own strongest."""
+        hough = self._pairs(lines, view, point) + self._singles(lines, view, point)
+        return sorted(_normalised(hough) + _normalised(self._rays(grey, view, point)), key=lambda line: -line.strength)
+
+    def _rays(self, grey: Image, view: RoadView, point: Perspective) -> list[_Line]:
+        found = self.fan.lines(grey, point)
+        rows = np.array([view.row_at(_NEAR), view.row_at(_FAR)])
+        near, far = point.columns(found.slope, rows, view.bottom)
+        return [_Line(float(n), float(f), float(s)) for n, f, s in zip(near, far, found.strength, strict=True)]
+
+    def _pairs(self, lines: HoughLines, view: RoadView, point: Perspective) -> list[_Line]:
+        """Rising and falling edges that bound one bright marking; the line handed on runs between them."""
+        near, far = _columns(lines, view)
+        rising, falling = np.flatnonzero(lines.rising), np.flatnonzero(~lines.rising)
+        width = (near[None, falling] - near[rising, None]) / view.depth
+        width_far = (far[None, falling] - far[rising, None]) / (_FAR * view.depth)
+        fits = (width >= self.least_width) & (width <= self.most_width) & (np.abs(width - width_far) <= 0.12)
+        i, j = np.nonzero(fits)
+        a, b = rising[i], falling[j]
+        between = 0.5 * (near[a] + near[b]), 0.5 * (far[a] + far[b])
+        # Paint is narrow: pairs wider than a single marking count less, down to a half for a double line.
+        narrow = np.clip(1.3 - 2.0 * width[i, j], 0.5, 1.0)
+        strength = 2.0 * np.sqrt(lines.votes[a] * lines.votes[b]) * narrow * _aimed(*between, view, point)
+        return [
+            _Line(float(n), float(f), float(s), float(w))
+            for n, f, s, w in zip(*between, strength, width[i, j], strict=True)
+        ]
+
+    def _singles(self, lines: HoughLines, view: RoadView, point: Perspective) -> list[_Line]:
+        """Unpaired edges, second class: a worn marking, a road edge, one side of a wide band."""
+        near, far = _columns(lines, view)
+        strength = 0.6 * lines.votes * _aimed(near, far, view, point)
+        return [_Line(float(n), float(f), float(s)) for n, f, s in zip(near, far, strength, strict=True)]
+
+    def _suppress(self, ranked: list[_Line], view: RoadView) -> list[_Line]:
+        """The strongest lines of which no two are nearer than `separation` at both rows, across the flatter ones."""
+        kept: list[_Line] = []
+        for line in ranked:
+            slope = (line.near - line.far) / ((_NEAR - _FAR) * view.depth)
+            least = self.separation * view.depth * math.hypot(1.0, slope)
+            if not any(
+                abs(line.near - other.near) < _NEAR * least and abs(line.far - other.far) < _FAR * least
+                for other in kept
+            ):
+                kept.append(line)
+        return kept
+
+
+def _columns(lines: HoughLines, view: RoadView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Columns of Hough lines at the near and the far row."""
+    return lines.x_bottom, lines.x_bottom - (_NEAR - _FAR) * view.depth * lines.slope
+
+
+def _aimed(
+    near: NDArray[np.float64], far: NDArray[np.float64], view: RoadView, point: Perspective
+) -> NDArray[np.float64]:
+    """How well lines keep to the shared perspective, from 1 down to 0.2: boundaries of one road share it."""
+    rows = np.array([view.row_at(_NEAR), view.row_at(_FAR)])
+    k = point.k(view.bottom)
+    slope = (near - point.x - k / view.depth) / view.depth
+    expected = point.columns(slope, rows, view.bottom)[1]
+    miss = np.abs(far - expected) / np.hypot(1.0, slope)
+    aimed: NDArray[np.float64] = 0.2 + 0.8 / (1.0 + (miss / (0.02 * view.width)) ** 2)
+    return aimed
+
+
+def _normalised(lines: list[_Line]) -> list[_Line]:
+    strongest = max((line.strength for line in lines), default=1.0)
+    return [replace(line, strength=line.strength / strongest) for line in lines]
+
+
+def _curve(line: _Line, view: RoadView, point: Perspective) -> Curve:
+    """The boundary through a line's two columns, with the bend that all boundaries of the road share."""
+    k = point.k(view.bottom)
+    u_near, u_far = _NEAR * view.depth, _FAR * view.depth
+    b = ((line.near - k / u_near) - (line.far - k / u_far)) / (u_near - u_far)
+    return Curve(view.horizon, (line.near - k / u_near - b * u_near, b, k))
+
+
+def _candidate(line: _Line, curve: Curve, view: RoadView) -> Candidate | None:
+    rows = visible_rows(curve, view, TOP_SHARE)
+    if rows is None or rows[1] - rows[0] < 0.15 * view.depth:
+        return None
+    return Candidate(curve, rows[0], rows[1], line.strength, line.width)

@@ -1,0 +1,48 @@
+"""Strips along candidates, warped to the network's input: a candidate's marking stands upright in its patch.
+
+Training and serving cut their patches here, so that the network sees in service what it saw in training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.detection.edges import resized
+from lanestream.geometry import RoadView, Scaling, StripGeometry
+from lanestream.lanes import Candidate, Image
+
+
+@dataclass(frozen=True)
+class StripCutter:
+    """Cuts patches; images wider than `detail_width` are reduced to it first, or their near rows would alias."""
+
+    geometry: StripGeometry = StripGeometry()
+    detail_width: int = 1280
+
+    def cut(self, image: Image, candidates: Sequence[Candidate], view: RoadView) -> NDArray[np.uint8]:
+        """RGB patches (N, size, size, 3) uint8 of a BGR image (H, W, 3), in the order of `candidates`."""
+        size = self.geometry.size
+        if not candidates:
+            return np.zeros((0, size, size, 3), np.uint8)
+        scaling = Scaling(min(1.0, self.detail_width / view.width))
+        detail = resized(image, scaling)
+        detail_view = view.scaled(scaling, detail.shape[1], detail.shape[0])
+        grids = [self._grid(candidate, detail_view, scaling) for candidate in candidates]
+        columns = np.concatenate([grid[0] for grid in grids])
+        rows = np.concatenate([grid[1] for grid in grids])
+        # The border is mirrored: black would tell the network where the image ends, which no road does.
+        patches = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        rgb = cv2.cvtColor(patches, cv2.COLOR_BGR2RGB)
+        return np.asarray(rgb, dtype=np.uint8).reshape(-1, size, size, 3)
+
+    def _grid(
+        self, candidate: Candidate, view: RoadView, scaling: Scaling
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        curve = scaling.curve_to_working(candidate.curve)
+        top, bottom = scaling.to_working(candidate.top), scaling.to_working(candidate.bottom)
+        return self.geometry.grid(curve, top, bottom, view)

@@ -1,0 +1,63 @@
+"""What can be set about the service: by environment variables with the prefix LANESTREAM_, or on the command line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from lanestream.errors import SettingsError
+from lanestream.imaging import MOST_PIXELS, ImageLimits
+
+_PREFIX = "LANESTREAM_"
+
+
+def _processors() -> int:
+    """Processors that this process may use, which in a container are fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Settings(BaseSettings):
+    """The service's settings; each is read from LANESTREAM_<NAME>."""
+
+    model_config = SettingsConfigDict(env_prefix=_PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
+
+    host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
+    model: Path | None = Field(default=None, description="ONNX file of the network; the shipped one where absent.")
+    provider: Literal["auto", "cpu", "cuda"] = Field(default="auto", description="Where the network runs.")
+    max_bytes: int = Field(default=8 << 20, ge=1024, le=1 << 28, description="Bytes of one image file at most.")
+    max_pixels: int = Field(default=4096 * 2304, ge=1 << 16, le=MOST_PIXELS, description="Pixels of one image at most.")
+    max_sessions: int = Field(default=64, ge=1, description="Streams and single images at a time at most.")
+    credits: int = Field(default=8, ge=1, le=256, description="Unanswered frames of a stream in mode `all` at most.")
+    threads: Annotated[int, Field(ge=1, le=256, description="Threads that decode, propose and track.")] = Field(
+        default_factory=_processors
+    )
+    opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV takes for one image.")
+
+    @property
+    def image_limits(self) -> ImageLimits:
+        """The limits of one image."""
+        return ImageLimits(max_bytes=self.max_bytes, max_pixels=self.max_pixels)
+
+
+def load_settings(**given: object) -> Settings:
+    """Settings from the environment, where not `given` (None counts as not given).
+
+    Raises SettingsError with one line that names the variable or option.
+    """
+    chosen = {name: value for name, value in given.items() if value is not None}
+    try:
+        return Settings(**chosen)  # type: ignore[arg-type]
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        name = str(problem["loc"][0])
+        label = f"--{name}" if name in chosen else _PREFIX + name.upper()
+        raise SettingsError(f"{label} = {problem['input']!r}: {_sentence(problem['msg'])}") from None
+
+
+def _sentence(message: str) -> str:
+    return message[:1].lower() + message[1:]
