@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lanestream.detection import LaneDetector, Network
+from lanestream.detection.detector import CandidateDetector
+from lanestream.detection.strips import StripCutter
+from lanestream.geometry import StripGeometry
+from lanestream.inference import OnnxModel
 from lanestream.sessions import Session
 
 if TYPE_CHECKING:
+    from lanestream.inference.providers import Provider
     from lanestream.lanes import FrameResult, Image
+
+
+# The network that is shipped and served where no other is named.
+SHIPPED_MODEL = Path(__file__).parent / "models" / "classifier.onnx"
 
 
 class Engine:
@@ -39,3 +49,15 @@ class Engine:
             "track": 1e3 * (tracked - inferred),
         }
         return replace(result, timing_ms=timing)
+
+
+def load_engine(model: Path | None = None, provider: Provider = "auto") -> Engine:
+    """The engine for the model file at `model`, the shipped one where None, warmed up.
+
+    Raises ModelError for a file that can't be served, ProviderError where `provider` can't be had.
+    """
+    network = OnnxModel.load(model or SHIPPED_MODEL, provider)
+    network.warm_up()
+    strip = network.info.strip
+    geometry = StripGeometry(strip.size, strip.half_width, strip.min_half_width)
+    return Engine(CandidateDetector(network.info.threshold, cutter=StripCutter(geometry)), network)

@@ -6,6 +6,7 @@ A message says what was wrong; a hint says what is accepted or what to do. Both 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
@@ -160,3 +161,14 @@ def _kinds(root: type[LanestreamError]) -> Iterator[type[LanestreamError]]:
     for kind in root.__subclasses__():
         yield kind
         yield from _kinds(kind)
+
+
+@contextmanager
+def needs_extra(extra: str) -> Iterator[None]:
+    """Imports in the block need the optional packages `extra`; MissingExtraError says how to get them."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"this needs the package {error.name}, which is not installed", f"pip install 'lanestream[{extra}]'"
+        ) from None

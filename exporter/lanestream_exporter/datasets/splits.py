@@ -48,6 +48,14 @@ def real_frames(root: Path, split: Split) -> Iterator[tuple[LabelledFrame, Image
     yield from _country_frames(root / "udacity_ch2", _COUNTRY_FRAMES[split])
 
 
+def labelled_clips(root: Path, split: Split) -> Iterator[tuple[Path, Path, range]]:
+    """(video, labels, frames) of the clips of a split; `frames` is the stretch of the video that belongs to it."""
+    for clip in _CLIPS[split]:
+        yield root / "udacity/clips" / f"{clip}.mp4", root / "udacity/labels" / f"{clip}.jsonl", range(1_000_000)
+    country = root / "udacity_ch2"
+    yield country / "country_road_140s.mp4", country / "labels.jsonl", _COUNTRY_FRAMES[split]
+
+
 def _country_frames(root: Path, wanted: range) -> Iterator[tuple[LabelledFrame, Image]]:
     """Labelled frames of the country road from the original JPEGs, which the video has compressed once more."""
     labels = root / "labels.jsonl"

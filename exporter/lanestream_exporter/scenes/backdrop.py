@@ -58,7 +58,7 @@ def _sky(canvas: Canvas, backdrop: Backdrop, bottom: int) -> Layer:
     if backdrop.clouds > 0.0:
         noise = _angular_noise(canvas, bottom, (70.0, 260.0), backdrop.seed)
         cover = np.clip((noise - 1.6 + 3.2 * backdrop.clouds) * 0.6, 0.0, 0.92)[..., None]
-        white = np.float32(max(backdrop.skyline) * 0.97) * (1.0 - 0.12 * np.clip(noise, 0.0, 2.0))[..., None]
+        white = np.float32(max(backdrop.skyline)) * (1.0 - 0.08 * np.clip(noise, 0.0, 2.0))[..., None]
         sky += cover * (white - sky)
     return np.asarray(sky * np.float32(canvas.light.glow), dtype=np.float32)
 

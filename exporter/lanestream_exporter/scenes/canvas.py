@@ -62,6 +62,14 @@ class Canvas:
             mixed = region + alpha[inside][..., None] * (patch[inside] - region)
             region[...] = mixed.astype(np.uint8)
 
+    def glow(self, point: FloatArray, radius: float, strength: float) -> None:
+        """Adds a soft white light around an image point; it fades out within `radius` pixels."""
+        size = round(radius)
+        left, top = round(float(point[0])) - size, round(float(point[1])) - size
+        away = np.hypot(*np.ogrid[-size : size + 1, -size : size + 1]) / max(radius, 1.0)
+        alpha = (strength * np.square(np.clip(1.0 - away, 0.0, 1.0))).astype(np.float32)
+        self.blend(np.full((*alpha.shape, 3), 255.0, np.float32), alpha, left, top)
+
     def darken(self, points: FloatArray, depth: float, softness: float) -> None:
         """Takes the share `depth` of light from a polygon, with edges blurred over `softness` pixels."""
         margin = 2.0 * softness + 2.0

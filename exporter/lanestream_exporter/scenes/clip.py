@@ -30,6 +30,7 @@ SPEEDS: dict[Style, tuple[float, float]] = {  # metres a second
     "lane": (7.0, 13.0),
 }
 CHANGE_TIME = 4.0  # seconds a lane change takes
+FAIR_CLOUDS = 0.35  # share of the sky on a fair day, at most
 CLEAR_AHEAD = 6.0  # metres that the vehicle keeps from others
 
 
@@ -119,7 +120,8 @@ def sample_clip(
     scene = compose_scene(dice, (width, height), drive.style, weather, motion.speed * duration + REACH)
     if drive.fair:
         clean = Lens(saturation=1.05, noise=1.2, seed=dice.seed())
-        scene = replace(scene, lens=clean, air=Air(scene.air.color, 2500.0))
+        backdrop = replace(scene.backdrop, clouds=min(FAIR_CLOUDS, scene.backdrop.clouds))
+        scene = replace(scene, lens=clean, air=Air(scene.air.color, 2500.0), backdrop=backdrop)
     # A file of its own would only repeat what the video's encoder does to the picture.
     scene = replace(scene, lens=replace(scene.lens, quality=0))
     if drive.lane_change:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 VERGES: dict[str, Colour] = {
     "grass": (0.16, 0.38, 0.29),
-    "meadow": (0.13, 0.45, 0.34),
+    "meadow": (0.16, 0.41, 0.32),
     "dry grass": (0.3, 0.46, 0.52),
     "sand": (0.42, 0.54, 0.62),
     "gravel": (0.4, 0.43, 0.45),
@@ -43,6 +43,7 @@ def sample_surface(dice: Dice, layout: Layout) -> Surface:
         mottle=clean * dice.between(0.02, 0.06),
         streaks=clean * dice.between(0.02, 0.06),
         cracks=dice.between(0.15, 0.6) if asphalt and dice.chance(0.2) else 0.0,
+        pits=dice.between(0.2, 0.8) if dice.chance(0.45) else 0.0,
         seed=dice.seed(),
     )
 
@@ -64,9 +65,10 @@ def _materials(dice: Dice, layout: Layout) -> tuple[Material, ...]:
         gravel = grey(dice, dice.between(0.35, 0.55))
         width = dice.between(0.3, 2.0)
         parts += [Material(left, left + width, gravel, 2.5), Material(right - width, right, gravel, 2.5)]
-    if layout.style == "highway" and dice.chance(0.7):
-        # The other carriageway, seen over the barrier.
+    if layout.opposite > 0.0:
         parts.append(Material(left + 1.0, left + 14.0, grey(dice, layout.tone), 1.0))
+    elif layout.opposite < 0.0:
+        parts.append(Material(right - 14.0, right - 1.0, grey(dice, layout.tone), 1.0))
     shoulder = grey(dice, _other_tone(dice, layout)) if dice.chance(0.55) else grey(dice, layout.tone)
     parts.append(Material(right, left, shoulder, 1.2))
     parts += _lanes(dice, layout)
@@ -188,7 +190,7 @@ def _ghost(dice: Dice, layout: Layout) -> Ghost:
         seed=dice.seed(),
     )
     gain = dice.between(1.12, 1.35) if dice.chance(0.6) else dice.between(0.55, 0.85)
-    return Ghost(spot, marking, dice.around(0.006), min(0.75, layout.tone * gain))
+    return Ghost(spot, marking, dice.between(0.0, 0.4), dice.between(60.0, 200.0), min(0.75, layout.tone * gain))
 
 
 def _stencil(dice: Dice, layout: Layout, length: float) -> Stencil:

@@ -49,6 +49,7 @@ class Layout:
     paved: tuple[float, float]  # right and left edge of the pavement
     concrete: bool
     tone: float  # brightness of the driving surface
+    opposite: float = 0.0  # +1 where another carriageway lies beyond the left edge, -1 the right, 0 neither
 
     def mirrored(self) -> Layout:
         """The same road where people drive on the left."""
@@ -64,6 +65,7 @@ class Layout:
             ahead=tuple(-u for u in self.ahead),
             oncoming=tuple(-u for u in self.oncoming),
             paved=(-self.paved[1], -self.paved[0]),
+            opposite=-self.opposite,
         )
 
 
@@ -82,9 +84,11 @@ class _Painter:
 
     @classmethod
     def of(cls, dice: Dice, tone: float) -> _Painter:
+        """A painter for a road whose surface has this brightness."""
         period, dash = dice.pick(DASHES)
-        brightness = min(0.98, tone + (dice.between(0.14, 0.3) if dice.chance(0.3) else dice.between(0.25, 0.65)))
-        wear = dice.between(0.0, 0.25) if dice.chance(0.55) else dice.between(0.2, 0.75)
+        faint = dice.chance(0.4)  # old paint on pale concrete is only a little lighter than the road
+        brightness = min(0.98, tone + (dice.between(0.09, 0.22) if faint else dice.between(0.2, 0.6)))
+        wear = dice.between(0.0, 0.25) if dice.chance(0.5) else dice.between(0.2, 0.78)
         return cls(dice, tone, period, dash, dice.between(0.0, period), wear, brightness, dice.between(0.1, 0.2))
 
     def line(self, kind: MarkingKind, color: PaintColour) -> Marking:
@@ -94,7 +98,7 @@ class _Painter:
             kind=kind,
             color=color,
             width=min(0.3, self.width * dice.between(0.9, 1.4)),
-            brightness=min(0.98, max(self.tone + 0.1, self.brightness + dice.around(0.04))),
+            brightness=min(0.98, max(self.tone + 0.07, self.brightness + dice.around(0.04))),
             wear=min(0.8, max(0.0, self.wear + dice.around(0.08))),
             period=self.period,
             dash=self.dash,
@@ -119,8 +123,8 @@ class _Painter:
             dots=dots,
             dash=spacing * (dots - 1),
             period=dice.between(2.0, 7.3) if dots == 1 else max(self.period, spacing * dots + 2.0),
-            wear=dice.between(0.0, 0.35),
-            brightness=min(1.0, common.brightness + 0.15),
+            wear=dice.between(0.0, 0.45),
+            brightness=min(1.0, common.brightness + dice.between(0.0, 0.15)),
         )
 
 
@@ -157,7 +161,7 @@ def _highway(dice: Dice) -> Layout:
     left, right = dice.between(0.4, 3.2), dice.between(0.6, 3.6)
     paved = (boundaries[-1].u - right, boundaries[0].u + left)
     ahead = tuple((ego - index) * width for index in range(lanes))
-    return Layout("highway", tuple(boundaries), ahead, (), width, paved, concrete, tone)
+    return Layout("highway", tuple(boundaries), ahead, (), width, paved, concrete, tone, float(dice.chance(0.7)))
 
 
 def _country(dice: Dice) -> Layout:

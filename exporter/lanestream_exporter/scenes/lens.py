@@ -66,7 +66,7 @@ class Lens:
 
 
 def develop(image: Image, lens: Lens) -> Image:
-    """The picture as the camera's file shows it: (H, W, 3) uint8 in, the same out."""
+    """The picture as the camera's file shows it, (H, W, 3) uint8. The bonnet is drawn into `image` itself."""
     if lens.bonnet:
         _draw_bonnet(image, lens.bonnet)
     if lens.saturation != 1.0:

@@ -12,7 +12,6 @@ from lanestream_exporter.scenes.noise import noise_tiles, sample
 from lanestream_exporter.scenes.view import Grid, Layer, coverage
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.camera import FloatArray
     from lanestream_exporter.scenes.surface import Colour
 
 
@@ -103,24 +102,35 @@ def haze_ground(grid: Grid, air: Air, ground: Layer) -> None:
 
 
 def _shadows(grid: Grid, shadows: tuple[Shadow, ...]) -> Layer:
+    """Depth of shadow over the ground, 0 to 1: where several fall, the deepest."""
     total = np.zeros(grid.shape, np.float32)
     for shadow in shadows:
         if isinstance(shadow, LineShadow):
-            band = grid.band(shadow.u - shadow.width, shadow.u + shadow.width)
-            footprint = np.maximum(band.across, np.float32(shadow.softness))
-            cover = coverage(band.u - np.float32(shadow.u), shadow.width, footprint)
-            flat = total.reshape(-1)
-            flat[band.index] = np.maximum(flat[band.index], cover)
+            _cast_line(grid, shadow, total)
         elif isinstance(shadow, BandShadow):
-            lean = abs(shadow.slant) * 40.0
-            rows = _rows_between(grid, shadow.s - shadow.length - lean, shadow.s + shadow.length + lean)
-            offset = grid.s[rows] - np.float32(shadow.slant) * grid.u[rows] - np.float32(shadow.s)
-            footprint = np.maximum(grid.along[rows], np.float32(shadow.softness))[:, None]
-            total[rows] = np.maximum(total[rows], coverage(offset, shadow.length, footprint))
+            _cast_band(grid, shadow, total)
         elif grid.view.spans(shadow.s, shadow.s + shadow.length):
             rows = _rows_between(grid, shadow.s - 15.0, shadow.s + shadow.length + 15.0)
             total[rows] = np.maximum(total[rows], _tree_shade(grid, rows, shadow))
     return total
+
+
+def _cast_line(grid: Grid, shadow: LineShadow, total: Layer) -> None:
+    band = grid.band(shadow.u - shadow.width, shadow.u + shadow.width)
+    footprint = np.maximum(band.across, np.float32(shadow.softness))
+    cover = coverage(band.u - np.float32(shadow.u), shadow.width, footprint)
+    flat = total.reshape(-1)
+    flat[band.index] = np.maximum(flat[band.index], cover)
+
+
+def _cast_band(grid: Grid, shadow: BandShadow, total: Layer) -> None:
+    reach = shadow.length + 40.0 * abs(shadow.slant)
+    if not grid.view.spans(shadow.s - reach, shadow.s + reach):
+        return
+    rows = _rows_between(grid, shadow.s - reach, shadow.s + reach)
+    offset = grid.s[rows] - np.float32(shadow.slant) * grid.u[rows] - np.float32(shadow.s)
+    footprint = np.maximum(grid.along[rows], np.float32(shadow.softness))[:, None]
+    total[rows] = np.maximum(total[rows], coverage(offset, shadow.length, footprint))
 
 
 def _rows_between(grid: Grid, low: float, high: float) -> slice:
@@ -148,7 +158,7 @@ def _tree_shade(grid: Grid, rows: slice, shadow: TreeShadow) -> Layer:
 
 
 def _headlights(grid: Grid, light: Light) -> Layer:
-    """Gain of the ground at night: two overlapping cones, dark right under the bonnet."""
+    """Gain of the ground at night: a cone of light, dark right before the bumper."""
     camera = grid.view.camera
     ray = ((camera.centre - np.arange(camera.width)) / camera.focal).astype(np.float32)
     x = grid.x[:, None]

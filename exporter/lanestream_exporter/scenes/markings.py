@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -25,7 +26,8 @@ class Ghost:
 
     u: float
     marking: Marking
-    slant: float  # metres it moves to the left per metre of road
+    sway: float  # metres it swings to either side
+    swing: float  # metres of road that one swing takes
     tone: float  # brightness, 0 to 1
 
 
@@ -45,7 +47,7 @@ class Stencil:
 
 @dataclass(frozen=True)
 class Bars:
-    """Bars across the road: a stop line, the bars of a crossing, rumble strips. Metres."""
+    """Bars across the road: a stop line, or the bars of a crossing. Metres."""
 
     s: float
     length: float  # along the road
@@ -87,17 +89,9 @@ def paint_others(grid: Grid, paintwork: Paintwork, ground: Layer) -> None:
     """Paints ghosts, stencils and bars into the unlit ground."""
     view = grid.view
     for ghost in paintwork.ghosts:
-        reach = 0.3 + abs(ghost.slant) * 60.0
-        band = grid.band(ghost.u - reach, ghost.u + reach)
-        straightened = Band(
-            band.index,
-            band.u - np.float32(ghost.slant) * (band.s - np.float32(grid.view.s[0])),
-            band.s,
-            band.across,
-            band.along,
-            band.distance,
-        )
-        cover = marking_cover(straightened, ghost.u, ghost.marking)
+        band = grid.band(ghost.u - ghost.sway - 0.3, ghost.u + ghost.sway + 0.3)
+        swung = np.float32(ghost.sway) * np.sin(band.s * np.float32(math.tau / ghost.swing))
+        cover = marking_cover(replace(band, u=band.u - swung), ghost.u, ghost.marking)
         _blend(ground, band, cover, (ghost.tone, ghost.tone, ghost.tone))
     for stencil in paintwork.stencils:
         if view.spans(stencil.s, stencil.s + stencil.length):
@@ -141,8 +135,11 @@ def _dots(band: Band, offset: Layer, s: Layer, marking: Marking) -> Layer:
     length = np.float32(marking.width) + np.minimum(rise, np.float32(0.4 * spacing))
     within = np.mod(s, np.float32(marking.period))
     nearest = np.clip(np.round(within / spacing), 0, marking.dots - 1) * np.float32(spacing)
-    cover = coverage((within - nearest).astype(np.float32), length.astype(np.float32), np.maximum(band.along, 0.01))
-    cover *= coverage(offset, marking.width, band.across)
+    ahead = (within - nearest).astype(np.float32)
+    cover = coverage(ahead, length.astype(np.float32), np.maximum(band.along, 0.01))
+    # Round from above: narrower towards its near and far end, where the picture can show it.
+    chord = np.sqrt(np.clip(1.0 - np.square(ahead / length) * 3.0, 0.1, 1.0)).astype(np.float32)
+    cover *= coverage(offset, np.float32(marking.width) * chord, band.across)
     keep = np.random.default_rng(marking.seed).random(64) >= marking.wear
     group = np.floor(s / np.float32(marking.period)) * marking.dots + nearest / np.float32(spacing)
     return np.asarray(cover * keep[np.round(group).astype(np.int64) % 64], dtype=np.float32)
@@ -171,15 +168,14 @@ def _blend(ground: Layer, band: Band, cover: Layer, color: Colour) -> None:
 
 def _paint_stencil(grid: Grid, stencil: Stencil, ground: Layer) -> None:
     band = grid.band(stencil.u - stencil.width / 2.0, stencil.u + stencil.width / 2.0)
-    near = (band.s >= stencil.s) & (band.s <= stencil.s + stencil.length)
-    if not near.any():
+    band = band.between(stencil.s, stencil.s + stencil.length)
+    if not band.index.size:
         return
-    band = Band(*(values[near] for values in vars(band).values()))
     mask = stencil_mask(stencil.text)
     rows, columns = mask.shape
     right = (np.float32(stencil.u + stencil.width / 2.0) - band.u) * np.float32(columns / stencil.width)
     down = (np.float32(stencil.s + stencil.length) - band.s) * np.float32(rows / stencil.length)
-    cover = cv2.remap(mask, right[None], down[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[0]
+    cover = mask[np.clip(down, 0, rows - 1).astype(np.intp), np.clip(right, 0, columns - 1).astype(np.intp)]
     shade = stencil.brightness
     _blend(ground, band, cover * _left_over(band, stencil.wear, stencil.seed), (shade, shade, shade))
 
@@ -208,11 +204,8 @@ def stencil_mask(text: str) -> Layer:
 
 
 def _paint_bars(grid: Grid, bars: Bars, ground: Layer) -> None:
-    band = grid.band(bars.low, bars.high)
-    near = np.abs(band.s - np.float32(bars.s + bars.length / 2.0)) < bars.length / 2.0 + 1.0
-    if not near.any():
-        return
-    band = Band(*(values[near] for values in vars(band).values()))
+    # A far pixel covers metres of road, so the bars' ends show up to a metre beyond them.
+    band = grid.band(bars.low, bars.high).between(bars.s - 1.0, bars.s + bars.length + 1.0)
     cover = coverage(band.s - np.float32(bars.s + bars.length / 2.0), bars.length, band.along)
     if bars.period > 0.0:
         cover *= pulse(band.u - np.float32(bars.low), bars.period, bars.bar, band.across)

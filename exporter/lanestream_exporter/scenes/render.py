@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import compress
+from operator import not_
 from typing import TYPE_CHECKING
 
 import cv2
@@ -71,14 +73,13 @@ def _draw_things(canvas: Canvas, scene: Scene) -> None:
     everything: tuple[Bridge | Item | Vehicle, ...] = (*scene.bridges, *scene.items, *scene.traffic)
     things = [thing for thing in everything if canvas.view.spans(thing.s, thing.s + MARGIN)]
     things.sort(key=lambda thing: -thing.s)
-    outside = [thing for thing in things if isinstance(thing, Bridge) or not right < thing.u < left]
-    for thing in outside:
+    inside = [not isinstance(thing, Bridge) and right < thing.u < left for thing in things]
+    for thing in compress(things, map(not_, inside)):
         _draw_thing(canvas, thing)
     for wall in sorted(scene.walls, key=lambda wall: -abs(wall.u - scene.pose.u)):
         draw_wall(canvas, wall)
-    for thing in things:
-        if thing not in outside:
-            _draw_thing(canvas, thing)
+    for thing in compress(things, inside):
+        _draw_thing(canvas, thing)
 
 
 def _draw_thing(canvas: Canvas, thing: Bridge | Item | Vehicle) -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 WallKind = Literal["jersey", "rail", "kerb", "fence", "hedge"]
 ItemKind = Literal["tree", "bush", "post", "lamp", "sign", "house"]
 
-NEAREST = 1.2  # metres ahead of the lens where drawing of long things starts
+NEAREST = 0.5  # metres ahead of the lens where drawing of long things starts
 SPRITE = 128  # pixels on a side of a tree's picture
 SPRITES = 6  # different trees
 
@@ -43,8 +43,6 @@ class Wall:
     u: float
     height: float
     color: Colour
-    start: float = -1e6  # s
-    end: float = 1e6
 
 
 @dataclass(frozen=True)
@@ -75,9 +73,8 @@ class Bridge:
 def draw_wall(canvas: Canvas, wall: Wall) -> None:
     """Draws a wall from far to near."""
     view = canvas.view
-    s = view.s[(view.x > NEAREST) & (view.x < view.reach) & (view.s > wall.start) & (view.s < wall.end)]
-    if len(s) < 2:
-        return
+    ahead = view.s[(view.x > NEAREST) & (view.x < view.reach)]
+    s = np.concatenate([[view.here + NEAREST], ahead[ahead > view.here + NEAREST]])
     stripes, spacing = WALL_STRIPES[wall.kind]
     if spacing:
         _draw_posts(canvas, wall, s, spacing)
@@ -121,7 +118,7 @@ def draw_item(canvas: Canvas, item: Item) -> None:
     if not canvas.view.spans(item.s, item.s):
         return
     x, y = (float(value[0]) for value in canvas.view.place(np.array([item.s]), np.array([item.u])))
-    if x < NEAREST + 1.0 or x > canvas.view.reach:
+    if x < 2.0 or x > canvas.view.reach:
         return
     if item.kind in {"tree", "bush"}:
         _draw_tree(canvas, item, x, y)
@@ -173,7 +170,7 @@ def _tree_sprite(seed: int) -> Layer:
     noise = np.roll(noise_tiles().cloud, shift, (0, 1))[:SPRITE, :SPRITE]
     leaves = np.roll(noise_tiles().fine, shift, (0, 1))[:SPRITE, :SPRITE]
     slim = rng.uniform(0.8, 1.4)
-    radius = np.hypot((x - 0.5) * slim, (y - 0.38) * 0.95) / 0.37
+    radius = np.hypot((x - 0.5) * slim, (y - 0.42) * 0.95) / 0.33
     cover = np.clip((1.0 - radius + 0.16 * noise + 0.05 * leaves) * 9.0, 0.0, 1.0)
     trunk = (np.abs(x - 0.5) < rng.uniform(0.012, 0.035)) & (y > 0.4)
     shade = np.clip(0.75 + 0.3 * noise + 0.18 * leaves - 0.5 * (y - 0.3) + 0.3 * (0.5 - x), 0.1, 1.4)

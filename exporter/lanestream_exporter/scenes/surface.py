@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from lanestream_exporter.scenes.noise import ground_noise, noise_tiles, sample
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 Colour = tuple[float, float, float]  # blue, green, red, each 0 to 1 as displayed
 
 PROFILE_REACH = 60.0  # metres to either side that the lateral profile covers
-PROFILE_STEP = 0.02  # metres
+PROFILE_STEP = 0.01  # metres
+PROFILE_BLURS = (3, 9, 27, 81)  # steps of the profile that a pixel covers at most, from near rows to far ones
 
 
 @dataclass(frozen=True)
@@ -86,17 +88,14 @@ class Surface:
     mottle: float = 0.05  # strength of blotches
     streaks: float = 0.04  # strength of marks along the direction of travel
     cracks: float = 0.0  # 0 for none
+    pits: float = 0.0  # darkness of small holes and spots of dirt, 0 for none
     seed: int = 0
 
 
 def paint_ground(grid: Grid, surface: Surface) -> Layer:
     """The unlit ground, (rows, width, 3) in blue, green, red, 0 to 1."""
-    colours, roughness = _profile(surface)
-    last = len(colours) - 1
-    index = ((grid.u + np.float32(PROFILE_REACH)) * np.float32(1.0 / PROFILE_STEP)).astype(np.int32)
-    np.clip(index, 0, last, out=index)
-    ground = np.take(colours, index, axis=0)
-    gain = _texture(grid, surface, np.take(roughness, index)) + np.float32(1.0)
+    ground, roughness = _lay_materials(grid, surface)
+    gain = _texture(grid, surface, roughness) + np.float32(1.0)
     if surface.cracks > 0.0:
         gain *= _cracks(grid, surface)
     _lay_patches(grid, surface, gain)
@@ -106,20 +105,40 @@ def paint_ground(grid: Grid, surface: Surface) -> Layer:
     return np.asarray(ground, dtype=np.float32)
 
 
-def _profile(surface: Surface) -> tuple[Layer, Layer]:
-    """Colour (N, 3) and roughness (N,) by lateral position."""
+def _lay_materials(grid: Grid, surface: Surface) -> tuple[Layer, Layer]:
+    """Colour (rows, width, 3) and roughness (rows, width) of the ground, looked up by lateral position.
+
+    The profile is blurred to what a pixel covers, in a few steps from near to far rows, so that edges stay smooth.
+    """
+    profile = _profile(surface)
+    index = ((grid.u + np.float32(PROFILE_REACH)) * np.float32(1.0 / PROFILE_STEP)).astype(np.int32)
+    np.clip(index, 0, len(profile) - 1, out=index)
+    ground = np.empty((*grid.shape, 3), np.float32)
+    roughness = np.empty(grid.shape, np.float32)
+    steps = grid.x / np.float32(grid.view.camera.focal * PROFILE_STEP)
+    levels = np.searchsorted(PROFILE_BLURS[:-1], steps)
+    for level, blur in enumerate(PROFILE_BLURS):
+        rows = np.flatnonzero(levels == level)
+        if len(rows):
+            smooth = cv2.blur(profile, (1, blur), borderType=cv2.BORDER_REPLICATE)
+            here = slice(rows[0], rows[-1] + 1)  # farther rows cover more, so the rows of a level adjoin
+            ground[here] = np.take(smooth[:, :3], index[here], axis=0)
+            roughness[here] = np.take(smooth[:, 3], index[here])
+    return ground, roughness
+
+
+def _profile(surface: Surface) -> Layer:
+    """Blue, green, red and roughness by lateral position, (N, 4)."""
     u: FloatArray = np.arange(-PROFILE_REACH, PROFILE_REACH, PROFILE_STEP)
-    colours = np.zeros((len(u), 3), np.float32)
-    roughness = np.ones(len(u), np.float32)
+    profile = np.ones((len(u), 4), np.float32)
     for material in surface.materials:
         inside = slice(*np.searchsorted(u, (material.low, material.high)))
-        colours[inside] = material.color
-        roughness[inside] = material.roughness
+        profile[inside] = (*material.color, material.roughness)
     gain = np.ones(len(u))
     for track in surface.tracks:
         gain -= track.depth * np.exp(-0.5 * ((u - track.u) / track.width) ** 2)
-    colours *= gain[:, None].astype(np.float32)
-    return colours, roughness
+    profile[:, :3] *= gain[:, None].astype(np.float32)
+    return profile
 
 
 def _texture(grid: Grid, surface: Surface, roughness: Layer) -> Layer:
@@ -132,6 +151,9 @@ def _texture(grid: Grid, surface: Surface, roughness: Layer) -> Layer:
         fine = sample(tiles.fine, grid.u[near:], grid.s[near:], (0.009, 0.012), surface.seed + 2)
         fine *= np.clip((16.0 - grid.x[near:]) / 8.0, 0.0, 1.0)[:, None]
         texture[near:] += np.float32(surface.grain) * fine
+        if surface.pits > 0.0:
+            holes = sample(tiles.fine, grid.u[near:], grid.s[near:], (0.017, 0.024), surface.seed + 4)
+            texture[near:] -= np.float32(surface.pits) * np.clip(holes - 1.9, 0.0, 1.0)
     texture *= roughness
     streaks = ground_noise(tiles.cloud, grid, (0.03, 0.9), surface.seed + 1)
     streaks *= np.float32(surface.streaks) / np.square(roughness)

@@ -88,8 +88,8 @@ def sample_items(dice: Dice, layout: Layout, length: float) -> tuple[Item, ...]:
     woods = dice.between(0.0, 0.12) if dice.chance(0.75) else 0.0
     town = dice.between(0.02, 0.06) if layout.style == "street" else 0.004 * float(dice.chance(0.25))
     for side, edge in ((1.0, layout.paved[1]), (-1.0, -layout.paved[0])):
-        # On a highway the other carriageway lies between us and the trees on its far side.
-        margin = 14.0 if layout.style == "highway" and side > 0 else 4.0
+        # The other carriageway lies between us and the trees on its far side.
+        margin = 16.0 if layout.opposite == side else 4.0
         trees = int(woods * length * dice.between(0.2, 1.0))
         items += [_tree(dice, length, side, edge + margin) for _ in range(trees)]
         items += [_house(dice, length, side, edge + 12.0) for _ in range(int(town * length))]
@@ -155,9 +155,10 @@ def sample_bridges(dice: Dice, layout: Layout, length: float) -> tuple[Bridge, .
 def sample_shadows(dice: Dice, layout: Layout, stage: Stage) -> tuple[Shadow, ...]:
     """Shadows on the road: of bridges, walls, trees, posts and houses."""
     lean = dice.around(0.7)
-    shadows: list[Shadow] = []
-    for bridge in stage.bridges:
-        shadows.append(BandShadow(bridge.s + bridge.length / 2.0 + dice.around(5.0), bridge.length, 0.2 * lean))
+    shadows: list[Shadow] = [
+        BandShadow(bridge.s + bridge.length / 2.0 + dice.around(5.0), bridge.length, 0.2 * lean)
+        for bridge in stage.bridges
+    ]
     for wall in stage.walls:
         if wall.kind != "kerb" and dice.chance(0.4):
             wide = dice.between(0.3, 2.0)
@@ -200,7 +201,8 @@ def sample_traffic(dice: Dice, layout: Layout, start: float, length: float) -> t
         first = start + (dice.between(14.0, 60.0) if lane == 0.0 else dice.between(2.0, 40.0))
         speed = fast * dice.between(0.9, 1.1)
         vehicles += _queue(dice, lane, (first, start + length), density, speed)
-    far = (layout.paved[1] + 4.0, layout.paved[1] + 8.0) if layout.style == "highway" and dice.chance(0.5) else ()
+    edge = layout.paved[1] if layout.opposite > 0.0 else layout.paved[0]
+    far = [edge + layout.opposite * away for away in (4.0, 8.0)] if layout.opposite else []
     for lane in (*layout.oncoming, *far):
         vehicles += _queue(dice, lane, (start + dice.between(5.0, 60.0), start + length), density, -fast)
     if layout.style == "street" and dice.chance(0.5):
@@ -245,7 +247,7 @@ def sample_backdrop(dice: Dice, *, night: bool, dull: bool) -> Backdrop:
         skyline: Colour = (level * 1.05, level * 1.04, level * 1.02)
     else:
         blue = dice.between(0.6, 0.95)
-        zenith = (blue, blue * dice.between(0.62, 0.8), blue * dice.between(0.3, 0.6))
+        zenith = (blue, blue * dice.between(0.66, 0.8), blue * dice.between(0.3, 0.52))
         blue, pale = dice.between(0.85, 1.0), dice.between(0.88, 0.99)
         skyline = (blue, blue * pale, blue * pale**2)
     ridges = []

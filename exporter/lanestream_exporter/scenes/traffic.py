@@ -53,12 +53,14 @@ class _Box:
     nearest: float  # s where it is cut off, metres
 
     def points(self, shares: Sequence[Point]) -> FloatArray:
+        """Image pixels (N, 2) of points of the box."""
         along, across, up = np.array(shares, dtype=np.float64).T
         car = self.vehicle
         s = np.maximum(car.s + along * car.length, self.nearest)
         return self.canvas.view.project(s, car.u + (across - 0.5) * car.width, up * car.height)
 
     def fill(self, shares: Sequence[Point], color: Colour, gain: float = 1.0) -> None:
+        """Fills a shape on the box with a colour in the scene's light."""
         lit: Colour = (color[0] * gain, color[1] * gain, color[2] * gain)
         self.canvas.polygon(self.points(shares), self.canvas.tone(lit, self.x, self.y))
 
@@ -89,7 +91,7 @@ def draw_vehicle(canvas: Canvas, vehicle: Vehicle) -> None:
 
 def _visible_side(box: _Box) -> float | None:
     """1 where the left side faces the camera, 0 for the right, None for neither."""
-    for side, turn in ((0.0, 1.0), (1.0, -1.0)):
+    for side, turn in ((0.0, -1.0), (1.0, 1.0)):
         a, b, c = box.points([(0.0, side, 0.0), (1.0, side, 0.0), (1.0, side, 1.0)])
         if turn * ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])) > 0.0:
             return side
@@ -103,7 +105,7 @@ def _draw_shadow(box: _Box) -> None:
     lean = light.sun * box.vehicle.height / box.vehicle.width
     low, high = min(0.0, lean) - 0.04, max(0.0, lean) + 1.04
     ground = [(-0.06, low, 0.0), (-0.06, high, 0.0), (1.0, high, 0.0), (1.0, low, 0.0)]
-    width = box.canvas.view.camera.focal * 0.12 / box.x
+    width = box.canvas.view.camera.focal * 0.07 / box.x
     box.canvas.darken(box.points(ground), 0.55, width)
     under = [(-0.02, -0.02, 0.0), (-0.02, 1.02, 0.0), (0.98, 1.02, 0.0), (0.98, -0.02, 0.0)]
     box.canvas.darken(box.points(under), 0.75, width)
@@ -172,9 +174,9 @@ def _draw_tall(box: _Box, side: float | None) -> None:
 def _draw_lights(box: _Box) -> None:
     car = box.vehicle
     base = 0.42 if car.kind == "car" else 0.95 / car.height
-    size = 0.13 if car.kind == "car" else 0.05
+    size = 0.1 if car.kind == "car" else 0.05
     night = box.canvas.light.glow < 0.4
-    for inner, outer in ((0.04, 0.2), (0.96, 0.8)):
+    for inner, outer in ((0.03, 0.17), (0.97, 0.83)):
         lamp = [(0.0, inner, base), (0.0, inner, base + size), (0.0, outer, base + size), (0.0, outer, base)]
         if car.oncoming:
             glow: Colour = (1.0, 1.0, 1.0)
@@ -182,5 +184,8 @@ def _draw_lights(box: _Box) -> None:
             glow = (0.15, 0.15, 0.95) if car.braking else (0.08, 0.08, 0.6)
         if night or car.braking:
             box.shine(lamp, glow)
+            if night and car.oncoming:
+                reach = box.canvas.view.camera.focal * 1.2 / max(box.x, 10.0)
+                box.canvas.glow(box.points(lamp).mean(axis=0), reach, 0.8)
         else:
             box.fill(lamp, glow, 0.9)

@@ -32,6 +32,11 @@ class Band:
     along: Layer  # what the pixel covers along the road, metres
     distance: Layer  # forward distance, metres
 
+    def between(self, low: float, high: float) -> Band:
+        """The pixels of this band from s = low to s = high."""
+        inside = (self.s >= low) & (self.s <= high)
+        return Band(*(values[inside] for values in vars(self).values()))
+
 
 @dataclass(frozen=True)
 class RoadView:

@@ -21,15 +21,14 @@ if TYPE_CHECKING:
 class Prepared:
     """A frame on its way through a detector: network inputs (N, H, W, 3) uint8, and what `finish` needs again.
 
-    `view` is the frame's road view with the horizon that was used. `seen_horizon` is the row that this frame alone
-    suggests, None where it shows too little, and `horizon_weight` (0 to 1) how much it has to say.
+    `view` is the frame's road view with the horizon found in it, and `horizon_weight` (0 to 1) tells how much the frame
+    had to say about that.
     """
 
     image: Image
     inputs: NDArray[np.uint8]
     view: RoadView
     candidates: tuple[Candidate, ...] = ()
-    seen_horizon: float | None = None
     horizon_weight: float = 0.0
 
 
@@ -37,7 +36,7 @@ class LaneDetector(Protocol):
     """The two halves of a detector. Both are pure and may run in any thread."""
 
     def prepare(self, image: Image, horizon: float | None = None) -> Prepared:
-        """Network inputs for a BGR image; `horizon` is a row known from elsewhere, else it is estimated."""
+        """Network inputs for a BGR image; `horizon` is its row, give or take a nod of the camera, where it is known."""
         ...
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:

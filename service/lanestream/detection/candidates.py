@@ -26,7 +26,10 @@ _NEAR, _FAR = 1.0, 0.45
 
 @dataclass(frozen=True)
 class Proposals:
-    """The candidates of a frame in image pixels, best first, the road view they were found in, and its evidence."""
+    """The candidates of a frame in image pixels, best first, the road view they were found in, and its evidence.
+
+    `weight` (0 to 1) tells how much the frame had to say about where its horizon is.
+    """
 
     candidates: tuple[Candidate, ...]
     view: RoadView
@@ -62,7 +65,7 @@ class CandidateSearch:
     separation: float = 0.05
 
     def propose(self, image: Image, horizon: float | None = None) -> Proposals:
-        """The candidates of a BGR image (H, W, 3) uint8; `horizon` is its row where that is known."""
+        """The candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where that is known."""
         height, width = image.shape[:2]
         scaling = Scaling(WORKING_WIDTH / width)
         grey = resized(paint_grey(image), scaling)

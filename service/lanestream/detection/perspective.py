@@ -75,29 +75,30 @@ class PerspectiveSearch:
     """Coarse to fine around a first guess.
 
     `spread_x` and `spread_y` are how far the vanishing point may lie from the guess, in image widths, and `spread_bend`
-    the strongest bend. Ridges gather in cells of `cell` image widths on the bottom row; `prior` is the share of the best
+    the strongest bend; of a horizon that is known, the row is only `nod` away, as a camera nods on its wheels. Ridges gather in cells of `cell` image widths on the bottom row; `prior` is the share of the best
     score that a hypothesis at the end of its spread must make up for.
     """
 
     spread_x: float = 0.12
     spread_y: float = 0.1
     spread_bend: float = 0.06
+    nod: float = 0.02
     cell: float = 0.012
     reach: float = 3.0
     prior: float = 0.15
 
     def refine(self, guess: Perspective, ridges: RidgePoints, width: int, bottom: float, known: bool) -> Perspective:
-        """`guess` moved to where `ridges` gather most; its row stays where `known`."""
+        """`guess` moved to where `ridges` gather most; `known` tells that its row is."""
         if len(ridges.x) < 8:
             return guess
-        spread = np.array([self.spread_x * width, 0.0 if known else self.spread_y * width, self.spread_bend])
+        spread = np.array([self.spread_x * width, (self.nod if known else self.spread_y) * width, self.spread_bend])
         start = np.array([guess.x, guess.y, guess.bend])
         best = start
         for steps, share in ((7, 1.0), (5, 0.3), (5, 0.1)):
-            axes = [np.linspace(-reach, reach, steps) if reach > 0.0 else np.zeros(1) for reach in spread * share]
+            axes = [np.linspace(-reach, reach, steps) for reach in spread * share]
             hypotheses = best + np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
             score = self._gathering(hypotheses, ridges, width, bottom)
-            away = ((hypotheses - start) / np.maximum(spread, 1e-6)) ** 2
+            away = ((hypotheses - start) / spread) ** 2
             best = hypotheses[int(np.argmax(score - self.prior * score.max() * away.sum(axis=1)))]
         return replace(guess, x=float(best[0]), y=float(best[1]), bend=float(best[2]))
 

@@ -14,8 +14,8 @@ from lanestream.tracking import LaneTracker
 if TYPE_CHECKING:
     from lanestream.lanes import Image
 
-# How much of a new frame's horizon goes into the camera's: bumps should not move it, a minute of driving should.
-_HORIZON_GAIN = 0.08
+# The least that a new frame's horizon counts for the camera's: bumps should not move it, a minute of driving should.
+_HORIZON_GAIN = 0.04
 
 
 class Session:
@@ -29,6 +29,7 @@ class Session:
         self._detector = detector
         self._configured = horizon
         self._estimate: float | None = None
+        self._evidence = 0.0
         self._size: tuple[int, int] | None = None
         self._tracker = LaneTracker()
 
@@ -46,18 +47,15 @@ class Session:
         view = prepared.view
         if self._size not in (None, (view.width, view.height)):
             self._tracker = LaneTracker()
-            self._estimate = None
+            self._estimate, self._evidence = None, 0.0
         self._size = (view.width, view.height)
         detections = self._detector.finish(prepared, outputs)
         self._steady_horizon(prepared)
         return self._tracker.update(detections, timestamp, view)
 
     def _steady_horizon(self, prepared: Prepared) -> None:
-        seen = prepared.seen_horizon
-        if seen is None:
-            return
-        share = seen / prepared.view.height
-        if self._estimate is None:
-            self._estimate = share
-            return
-        self._estimate += _HORIZON_GAIN * prepared.horizon_weight * (share - self._estimate)
+        """A mean of what the frames say, weighed by how much they have to say, that forgets slowly."""
+        share = prepared.view.horizon / prepared.view.height
+        self._evidence += prepared.horizon_weight
+        gain = max(_HORIZON_GAIN * prepared.horizon_weight, prepared.horizon_weight / max(self._evidence, 1e-6))
+        self._estimate = share if self._estimate is None else self._estimate + gain * (share - self._estimate)

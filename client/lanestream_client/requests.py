@@ -1,0 +1,78 @@
+"""Requests and answers of `/v1/detect`, without their transport: shared by the client that blocks and the one that awaits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+from pydantic import ValidationError
+
+from lanestream.errors import ConnectionFailedError, LanestreamError, ProtocolError, SourceError, error_of
+from lanestream.protocol import LanesMessage
+from lanestream_client.service import ServiceInfo
+
+
+def image_bytes(image: bytes | str | Path) -> bytes:
+    """The image file itself, or the one at a path. Raises SourceError where it can't be read."""
+    if isinstance(image, bytes):
+        return image
+    try:
+        return Path(image).read_bytes()
+    except OSError as error:
+        raise SourceError(f"can't read {image}: {(error.strerror or str(error)).lower()}") from None
+
+
+def parameters(horizon: float | None) -> dict[str, float]:
+    """The query of a request."""
+    return {} if horizon is None else {"horizon": horizon}
+
+
+def lanes_of(response: httpx.Response) -> LanesMessage:
+    """The lanes in an answer. Raises the error that the service told."""
+    try:
+        return LanesMessage.model_validate_json(checked(response).content)
+    except ValidationError:
+        raise ProtocolError("the service answered with something unknown") from None
+
+
+def info_of(response: httpx.Response) -> ServiceInfo:
+    """What runs, in an answer of `/v1/models`. Raises the error that the service told."""
+    try:
+        model = checked(response).json()["models"][0]
+        return ServiceInfo(str(model["name"]), str(model["provider"]))
+    except (ValueError, TypeError, LookupError):
+        raise ProtocolError("the service answered with something unknown") from None
+
+
+def checked(response: httpx.Response) -> httpx.Response:
+    """The answer, where it is a good one. Raises the error that the service told."""
+    if response.is_success:
+        return response
+    raise _told(response)
+
+
+def _told(response: httpx.Response) -> LanestreamError:
+    try:
+        problem: dict[str, Any] = response.json()
+        return error_of(problem["code"], problem["message"], problem["hint"])
+    except (ValueError, TypeError, KeyError):
+        status = f"{response.status_code} {response.reason_phrase}".rstrip()
+        return ConnectionFailedError(f"{response.url} answered {status}", "is this a Lanestream service?")
+
+
+@contextmanager
+def reaching(place: str) -> Iterator[None]:
+    """Turns the transport's failures into ConnectionFailedError."""
+    try:
+        yield
+    except httpx.HTTPError as error:
+        raise unreachable(place, error) from None
+
+
+def unreachable(place: str, error: Exception) -> ConnectionFailedError:
+    """The error for a service that can't be reached."""
+    reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).removeprefix("[Errno 111] ")
+    return ConnectionFailedError(f"can't reach the service at {place}: {reason}", "start one with `lanestream serve`")

@@ -1,0 +1,58 @@
+"""What finds lanes: the service behind a URL, or an engine in this process. Commands and callers need not know which."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from lanestream.protocol import LanesMessage, Mode, SummaryMessage
+from lanestream_client.frames import SourceFrame, StreamResult
+
+
+@dataclass(frozen=True)
+class ServiceInfo:
+    """What runs: the model's name, and the execution provider that really runs it."""
+
+    model: str
+    provider: str
+
+
+class ResultStream(Protocol):
+    """The results of a stream as they come; afterwards the summary."""
+
+    @property
+    def summary(self) -> SummaryMessage | None:
+        """The final count; None until the stream came to its end."""
+        ...
+
+    def __iter__(self) -> Iterator[StreamResult]: ...
+
+
+class LaneService(Protocol):
+    """What finds lanes."""
+
+    def describe(self) -> ServiceInfo:
+        """What runs."""
+        ...
+
+    def detect(self, image: bytes | str | Path, *, horizon: float | None = None) -> LanesMessage:
+        """The lanes of one image file."""
+        ...
+
+    def stream(
+        self, frames: Iterable[SourceFrame | bytes], *, mode: Mode = "latest", horizon: float | None = None
+    ) -> ResultStream:
+        """The lanes of the frames of one camera."""
+        ...
+
+    def close(self) -> None:
+        """Gives up what is held."""
+        ...
+
+
+def as_frames(frames: Iterable[SourceFrame | bytes]) -> Iterator[SourceFrame]:
+    """Frames of a source as they are; image files numbered from 0, without capture times of their own."""
+    for seq, frame in enumerate(frames):
+        yield frame if isinstance(frame, SourceFrame) else SourceFrame(seq, None, data=frame)

@@ -1,0 +1,71 @@
+"""The life of one tracked boundary: tentative, confirmed, coasting, gone."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from filterpy.kalman import KalmanFilter
+
+from lanestream.lanes import Detection, FloatArray
+from lanestream.tracking.filter import Rows
+
+
+@dataclass
+class Track:
+    """A boundary with a past. Times are seconds on the tracker's own clock.
+
+    `hits` remembers for the last frames whether a detection backed it. `side` is -1 left and +1 right of the camera;
+    `crossing` counts the frames in which it has been clearly on the other one.
+    """
+
+    kalman: KalmanFilter
+    born: float
+    last_hit: float
+    probability: float
+    top: float
+    bottom: float
+    hits: deque[bool]
+    side: int
+    track_id: int | None = None
+    crossing: int = 0
+    detected: bool = True
+    predicted_columns: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.predicted_columns = self.kalman.x[:3].copy()
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether it has been given an identity."""
+        return self.track_id is not None
+
+    @property
+    def columns(self) -> FloatArray:
+        """Columns (3,) at the tracker's rows."""
+        columns: FloatArray = self.kalman.x[:3]
+        return columns
+
+    def hit(self, detection: Detection, columns: FloatArray, noise: FloatArray, now: float) -> None:
+        """Takes in a detection whose columns (3,) have the covariance `noise` (3, 3)."""
+        self.kalman.update(columns, R=noise)
+        self.hits.append(True)
+        self.detected = True
+        self.last_hit = now
+        self.probability += 0.4 * (detection.probability - self.probability)
+        self.top += 0.3 * (detection.top - self.top)
+        self.bottom += 0.3 * (detection.bottom - self.bottom)
+
+    def miss(self) -> None:
+        """Notes a frame without a detection."""
+        self.hits.append(False)
+        self.detected = False
+
+    def move_rows(self, old: Rows, new: Rows) -> None:
+        """Tells the state at other rows."""
+        matrix = old.mapped_to(new)
+        state, covariance = self.kalman.x, self.kalman.P
+        for i in (0, 3):
+            state[i : i + 3] = matrix @ state[i : i + 3]
+            for j in (0, 3):
+                covariance[i : i + 3, j : j + 3] = matrix @ covariance[i : i + 3, j : j + 3] @ matrix.T

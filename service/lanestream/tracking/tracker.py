@@ -1,0 +1,220 @@
+"""The tracker of one camera: detections in, boundaries with identities out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lanestream.geometry import RoadView, visible_rows
+from lanestream.lanes import Detection, EgoLane, FloatArray, FrameResult, LaneBoundary, LaneChange
+from lanestream.tracking.association import associate
+from lanestream.tracking.filter import Rows, boundary_filter, predict
+from lanestream.tracking.positions import LaneWidth, Sides, positions
+from lanestream.tracking.track import Track
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """A tracker's settings; lengths are shares of the depth of the road view unless said otherwise.
+
+    Boundaries are followed at the depths `shares`, where they accelerate by about `acceleration` per second squared and
+    start with up to `speed` per second. A detection's own covariance is widened by `noise` and by a horizon that nods by
+    `nod`. A track is confirmed by `birth[0]` hits in `birth[1]` frames and coasts for `coast_s` seconds. Tracks of one
+    marking, nearer than `merge` lane widths, become one.
+    """
+
+    shares: tuple[float, float, float] = (1.0, 0.5, 0.2)
+    acceleration: tuple[float, float, float] = (1.5, 0.8, 0.5)
+    speed: tuple[float, float, float] = (1.0, 0.5, 0.3)
+    noise: float = 0.012
+    nod: float = 0.006
+    birth: tuple[int, int] = (3, 5)
+    coast_s: float = 0.7
+    merge: float = 0.35
+
+
+class LaneTracker:
+    """Follows the boundaries of one camera with one Kalman filter each.
+
+    The first frames of a camera have nothing to be compared with, so there tentative tracks are told as well: a single
+    image gets its lanes, and a stream has lanes from its first frame on.
+    """
+
+    def __init__(self, settings: TrackerSettings | None = None) -> None:
+        self._settings = settings or TrackerSettings()
+        self._tracks: list[Track] = []
+        self._rows: Rows | None = None
+        self._width = LaneWidth()
+        self._sides = Sides()
+        self._next_id = 1
+        self._clock = 0.0
+        self._last_timestamp: float | None = None
+        self._frames = 0
+
+    def update(self, detections: Sequence[Detection], timestamp: float, view: RoadView) -> FrameResult:
+        """One step: `detections` of the frame captured at `timestamp` (seconds), seen in `view`.
+
+        A timestamp that goes backwards counts as no time at all.
+        """
+        rows = self._rows_for(view)
+        self._predict(self._elapsed(timestamp), view)
+        measured = [self._measured(detection, rows, view) for detection in detections]
+        pairs = associate(self._tracks, measured)
+        for i, j in pairs:
+            self._tracks[i].hit(detections[j], *measured[j], self._clock)
+        matched = {i for i, _ in pairs}
+        for i, track in enumerate(self._tracks):
+            if i not in matched:
+                track.miss()
+        self._shift_coasting(matched)
+        taken = {j for _, j in pairs}
+        for j, detection in enumerate(detections):
+            if j not in taken:
+                self._tracks.append(self._new(detection, *measured[j], view))
+        self._frames += 1
+        self._confirm()
+        self._tracks = self._merged(self._alive(view), view)
+        return self._result(view)
+
+    def _elapsed(self, timestamp: float) -> float:
+        last, self._last_timestamp = self._last_timestamp, timestamp
+        seconds = 0.0 if last is None else max(0.0, timestamp - last)
+        self._clock += seconds
+        return seconds
+
+    def _rows_for(self, view: RoadView) -> Rows:
+        """The rows to follow; chosen anew when the horizon has moved too far from the one they were chosen for."""
+        if self._rows is None or abs(self._rows.horizon - view.horizon) > 0.02 * view.depth:
+            rows = Rows.of(view, self._settings.shares)
+            for track in self._tracks:
+                track.move_rows(self._rows or rows, rows)
+            self._rows = rows
+        return self._rows
+
+    def _scaled(self, shares: tuple[float, float, float], view: RoadView) -> FloatArray:
+        return np.asarray(shares) * view.depth
+
+    def _predict(self, seconds: float, view: RoadView) -> None:
+        acceleration = self._scaled(self._settings.acceleration, view)
+        for track in self._tracks:
+            # Beyond the coasting time a track dies anyway, and a long step would only overflow.
+            predict(track.kalman, min(seconds, 2.0 * self._settings.coast_s), acceleration)
+            track.predicted_columns = track.columns.copy()
+
+    def _measured(self, detection: Detection, rows: Rows, view: RoadView) -> tuple[FloatArray, FloatArray]:
+        """Columns of a detection and what they are worth: the fit, the eye, and the nodding horizon that moves all."""
+        columns, covariance = rows.measured(detection.curve, detection.covariance)
+        nod = detection.curve.slope(rows.y) * self._settings.nod * view.depth
+        noise = (self._settings.noise * view.depth) ** 2 * np.eye(3)
+        return columns, covariance + noise + np.outer(nod, nod)
+
+    def _shift_coasting(self, matched: set[int]) -> None:
+        """Moves unmatched tracks by what the matched ones have in common: the camera moved, not the road."""
+        moved = [t.columns - t.predicted_columns for i, t in enumerate(self._tracks) if i in matched and t.confirmed]
+        if not moved:
+            return
+        shift = np.median(np.stack(moved), axis=0)
+        for i, track in enumerate(self._tracks):
+            if i not in matched:
+                track.kalman.x[:3] += shift
+
+    def _new(self, detection: Detection, columns: FloatArray, noise: FloatArray, view: RoadView) -> Track:
+        kalman = boundary_filter(columns, noise, self._scaled(self._settings.speed, view))
+        return Track(
+            kalman,
+            born=self._clock,
+            last_hit=self._clock,
+            probability=detection.probability,
+            top=detection.top,
+            bottom=detection.bottom,
+            hits=deque([True], maxlen=self._settings.birth[1]),
+            side=1 if detection.curve.x(view.bottom) >= _camera(view) else -1,
+        )
+
+    def _confirm(self) -> None:
+        hits_needed = self._settings.birth[0]
+        for track in sorted(self._tracks, key=lambda t: float(t.columns[0])):
+            if not track.confirmed and (sum(track.hits) >= hits_needed or self._frames < hits_needed):
+                track.track_id = self._next_id
+                self._next_id += 1
+
+    def _alive(self, view: RoadView) -> list[Track]:
+        return [track for track in self._tracks if self._lives(track, view)]
+
+    def _lives(self, track: Track, view: RoadView) -> bool:
+        if not track.confirmed:
+            misses = len(track.hits) - sum(track.hits)
+            return misses <= self._settings.birth[1] - self._settings.birth[0]
+        uncertain = float(np.sqrt(track.kalman.P[0, 0])) > self._settings.merge * self._width.value * view.depth
+        return self._clock - track.last_hit <= self._settings.coast_s and not uncertain
+
+    def _merged(self, tracks: list[Track], view: RoadView) -> list[Track]:
+        """Of tracks that have run together the oldest stays, with its identity."""
+        kept: list[Track] = []
+        least = self._settings.merge * self._width.value * self._scaled(self._settings.shares, view)
+        for track in sorted(tracks, key=lambda t: (not t.confirmed, t.born, t.track_id or 0)):
+            if not any(bool((np.abs(track.columns - other.columns) < least)[:2].all()) for other in kept):
+                kept.append(track)
+        return kept
+
+    def _result(self, view: RoadView) -> FrameResult:
+        assert self._rows is not None  # noqa: S101 - chosen at the start of the update
+        tracks = sorted((t for t in self._tracks if t.confirmed), key=lambda t: float(t.columns[0]))
+        curves = [self._rows.curve(track.columns) for track in tracks]
+        columns = [float(curve.x(view.bottom)) for curve in curves]
+        lane_width = self._width.value * view.depth
+        events = self._changes(tracks, columns, view, lane_width)
+        places = positions(tracks, columns, _camera(view), lane_width)
+        lanes = []
+        for track, curve, place in zip(tracks, curves, places, strict=True):
+            rows = visible_rows(curve, view, 0.1)
+            if rows is not None and track.track_id is not None:
+                lanes.append(self._boundary(track, place, (max(rows[0], track.top), rows[1])))
+        return FrameResult(tuple(lanes), self._ego(tracks, columns, places, view), view.horizon, tuple(events))
+
+    def _changes(
+        self, tracks: Sequence[Track], columns: Sequence[float], view: RoadView, lane_width: float
+    ) -> list[LaneChange]:
+        found = [
+            self._sides.update(t, c, _camera(view), lane_width) for t, c in zip(tracks, columns, strict=True)
+        ]
+        return [change for change in found if change is not None]
+
+    def _boundary(self, track: Track, place: int, rows: tuple[float, float]) -> LaneBoundary:
+        assert self._rows is not None and track.track_id is not None  # noqa: S101, PT018 - a confirmed track
+        # A boundary that nobody has seen for a while is less and less sure to be there.
+        fade = 1.0 - 0.5 * min(1.0, (self._clock - track.last_hit) / self._settings.coast_s)
+        return LaneBoundary(
+            track_id=track.track_id,
+            position=place,
+            state="detected" if track.detected else "predicted",
+            probability=track.probability * fade,
+            curve=self._rows.curve(track.columns),
+            covariance=self._rows.covariance_of_curve(track.kalman.P[:3, :3]),
+            top=rows[0],
+            bottom=rows[1],
+            age_s=self._clock - track.born,
+        )
+
+    def _ego(
+        self, tracks: Sequence[Track], columns: Sequence[float], places: Sequence[int], view: RoadView
+    ) -> EgoLane:
+        at = {place: index for index, place in enumerate(places)}
+        left, right = at.get(-1), at.get(1)
+        offset = None
+        if left is not None and right is not None:
+            width = columns[right] - columns[left]
+            self._width.learn(width / view.depth)
+            if width > 0.0:
+                offset = (_camera(view) - 0.5 * (columns[left] + columns[right])) / width
+        return EgoLane(
+            None if left is None else tracks[left].track_id, None if right is None else tracks[right].track_id, offset
+        )
+
+
+def _camera(view: RoadView) -> float:
+    """The column that the camera stands in."""
+    return (view.width - 1) / 2.0
