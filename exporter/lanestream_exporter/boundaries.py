@@ -1,8 +1,9 @@
 """Boundaries against labels, frame by frame: who found what, and how exactly.
 
-A boundary is right where it lies, over at least half of a label's rows, within 15 pixels on average and 20 pixels in the
-median of it, at 640 pixels of width and measured across the line; each label counts once. The distances are those of
-M. Aly, "Real time detection of lane markers in urban streets", 2008; one-to-one matching and the overlap are stricter.
+A boundary is right where it lies, over at least half of a label's rows, within 15 pixels on average and 20 pixels in
+the median of it, at 640 pixels of width and measured across the line; each label counts once. The distances are those
+of M. Aly, "Real time detection of lane markers in urban streets", 2008; one-to-one matching and the overlap are
+stricter.
 """
 
 from __future__ import annotations

@@ -16,10 +16,10 @@ from lanestream_exporter.alexnet import AlexNet, normalise
 def truncated(network: AlexNet, energy: float, patches: NDArray[np.uint8]) -> AlexNet:
     """A copy whose hidden linear layers keep the directions that hold the share `energy` of their outputs' variance.
 
-    The variance is that over RGB `patches` (N, H, W, 3) uint8: what the layers do to roads, not what their weights could
-    do to anything, most of which is the noise they were initialised with. Each layer becomes two thinner ones in a row;
-    1.0 keeps them as they are. Source: X. Zhang et al., "Accelerating very deep convolutional networks", 2015, section
-    3.1 (principal components of responses).
+    The variance is that over RGB `patches` (N, H, W, 3) uint8: what the layers do to roads, not what their weights
+    could do to anything, most of which is the noise they were initialised with. Each layer becomes two thinner ones in
+    a row; 1.0 keeps them as they are. Source: X. Zhang et al., "Accelerating very deep convolutional networks", 2015,
+    section 3.1 (principal components of responses).
     """
     small = copy.deepcopy(network).eval()
     if energy >= 1.0:

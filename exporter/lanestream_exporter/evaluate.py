@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score
 
 from lanestream.detection import Prepared
-from lanestream.detection.detector import CandidateDetector
 from lanestream.engine import Engine
 from lanestream.errors import SourceError
 from lanestream.lanes import FrameResult, Image
@@ -64,11 +63,11 @@ class CandidateTally:
 
 
 class Evaluation:
-    """Measures an engine whose detector proposes candidates."""
+    """Measures an engine: its detector, its network, and the tracker of its sessions."""
 
-    def __init__(self, engine: Engine, detector: CandidateDetector) -> None:
+    def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self._detector = detector
+        self._detector = engine.detector
         self._rule = TruthRule()
 
     def images(self, root: Path, split: Split) -> dict[str, Any]:

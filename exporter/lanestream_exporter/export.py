@@ -76,9 +76,9 @@ def export_classifier(
 ) -> ExportReport:
     """Writes the classifier in `checkpoint` to `out` (.onnx) and returns what it measures.
 
-    `calibration_patches` (training ones) choose what the linear layers keep and set the ranges of int8; `check` (validation ones) sets temperature and
-    threshold and proves the file. Raises CheckpointError, or ExportError where the file misses the tolerance; then
-    nothing is written.
+    `calibration_patches` (training ones) choose what the linear layers keep and set the ranges of int8; `check`
+    (validation ones) sets temperature and threshold and proves the file. Raises CheckpointError, or ExportError where
+    the file misses the tolerance; then nothing is written.
     """
     state = read_checkpoint(checkpoint)
     network = AlexNet()
@@ -143,8 +143,7 @@ def _proved(
     model = OnnxModel.load(path, "cpu")
     expected = _torch_probabilities(served, patches)
     by_batch = [
-        np.concatenate([model.run(patches[i : i + batch]) for i in range(0, len(patches), batch)])
-        for batch in _BATCHES
+        np.concatenate([model.run(patches[i : i + batch]) for i in range(0, len(patches), batch)]) for batch in _BATCHES
     ]
     difference = np.max([np.abs(got - expected)[:, 1] for got in by_batch], axis=0)
     accuracy = {
@@ -156,7 +155,7 @@ def _proved(
     missed = mean > _INT8_MEAN_TOLERANCE if precision == "int8" else largest > _TOLERANCE
     if missed or lost > _LARGEST_ACCURACY_LOSS:
         raise ExportError(
-            f"the file differs from PyTorch by {mean:.4f} on average, {largest:.4f} at most, and loses {lost:.1%} accuracy",
+            f"the file differs from PyTorch by {mean:.4f} on average, {largest:.4f} at most, and loses {lost:.1%}",
             "export with precision fp32 or a higher rank energy",
         )
     return ExportReport(out, path.stat().st_size, calibration, accuracy, mean, largest, len(patches))

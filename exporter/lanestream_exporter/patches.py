@@ -44,9 +44,9 @@ class TruthRule:
             return TRUE
         if any(distance * scale <= self.far and overlap > 0.0 for distance, overlap in measured):
             return UNSURE
-        return FALSE if frame.exhaustive or self._between(candidate, frame, view) else UNKNOWN
+        return FALSE if frame.exhaustive or self._between(candidate, frame) else UNKNOWN
 
-    def _between(self, candidate: Candidate, frame: LabelledFrame, view: RoadView) -> bool:
+    def _between(self, candidate: Candidate, frame: LabelledFrame) -> bool:
         """Whether the candidate runs between two labels, at some row that it shares with them."""
         rows = np.linspace(candidate.top, candidate.bottom, 16)
         columns = candidate.curve.x(rows)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.detection.candidates import CandidateSearch
 from lanestream.geometry import RoadView
 from lanestream_exporter.datasets.splits import Split, real_frames
 from lanestream_exporter.patches import PatchMaker
@@ -19,6 +20,8 @@ from lanestream_exporter.patchstore import write_store
 from lanestream_exporter.scenes import render_still, sample_scene
 
 SCENES_PER_FILE = 250
+
+_ROUNDS = 3
 
 # Sizes of rendered stills and how often each is drawn: cameras differ, and so does how sharp a strip is.
 _SIZES = ((640, 360), (640, 480), (960, 540), (1280, 720))
@@ -42,15 +45,15 @@ def rendered_stores(folder: Path, files: int, workers: int, done: Callable[[Path
     return paths
 
 
-def real_store(folder: Path, root: Path, split: Split, rounds: int) -> Path:
+def real_store(folder: Path, root: Path, split: Split) -> Path:
     """One file of patches from the labelled real frames of `split`; kept if it is already there.
 
-    Round 0 takes each frame's own candidates, every further one candidates beside its labels as well.
+    Frames give their own candidates; those of the training split also candidates beside their labels, a few times.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"real-{split}.npz"
     if not path.exists():
-        write_store(path, _real_patches(root, split, rounds))
+        write_store(path, _real_patches(root, split))
     return path
 
 
@@ -69,12 +72,13 @@ def _rendered_patches(number: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
         yield from maker.all_of(still.image, still.labels, view, rng)
 
 
-def _real_patches(root: Path, split: Split, rounds: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
-    maker = PatchMaker()
+def _real_patches(root: Path, split: Split) -> Iterator[tuple[NDArray[np.uint8], int]]:
+    # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
+    maker = PatchMaker(CandidateSearch(limit=32)) if split == "train" else PatchMaker()
     clear = partial(filter, lambda item: item[1] in (0, 1))
     for number, (frame, image) in enumerate(real_frames(root, split)):
         rng = np.random.default_rng([number, 1])
         proposals = maker.search.propose(image)
         yield from clear(zip(*maker.proposed(image, frame), strict=True))
-        for _ in range(rounds):
+        for _ in range(_ROUNDS if split == "train" else 0):
             yield from clear(zip(*maker.jittered(image, frame, proposals.view, rng), strict=True))

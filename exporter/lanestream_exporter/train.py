@@ -1,7 +1,7 @@
 """Training the classifier: rendered and real patches mixed, more real ones towards the end.
 
-A run lives in a folder: `last.pt` to go on from, `best.pt` by validation, `curve.csv`. It can be stopped at any time and
-goes on where it was.
+A run lives in a folder: `last.pt` to go on from, `best.pt` by validation, `curve.csv`. It can be stopped at any time
+and goes on where it was.
 """
 
 from __future__ import annotations
@@ -125,11 +125,12 @@ class ClassifierTraining:
         settings, data = self._settings, self._data
         rng = np.random.default_rng([settings.seed, step])
         real = round(settings.batch * settings.share_at(step))
-        patches, labels = zip(
-            *(draw(data.real, real, rng), draw(data.rendered, settings.batch - real, rng)), strict=True
-        )
+        real_patches, real_labels = draw(data.real, real, rng)
+        rendered_patches, rendered_labels = draw(data.rendered, settings.batch - real, rng)
+        patches = torch.from_numpy(np.concatenate([real_patches, rendered_patches]))
+        labels = torch.from_numpy(np.concatenate([real_labels, rendered_labels]))
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + step)
-        return augmented(torch.from_numpy(np.concatenate(patches)), generator), torch.from_numpy(np.concatenate(labels))
+        return augmented(patches, generator), labels
 
     def _learn(self, patches: Tensor, labels: Tensor) -> float:
         self._network.train()

@@ -5,19 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from lanestream.detection import LaneDetector, Network
+from lanestream.detection import Network
 from lanestream.detection.detector import CandidateDetector
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import StripGeometry
 from lanestream.inference import OnnxModel
+from lanestream.inference.providers import Provider
+from lanestream.lanes import FrameResult, Image
 from lanestream.sessions import Session
-
-if TYPE_CHECKING:
-    from lanestream.inference.providers import Provider
-    from lanestream.lanes import FrameResult, Image
-
 
 # The network that is shipped and served where no other is named.
 SHIPPED_MODEL = Path(__file__).parent / "models" / "classifier.onnx"
@@ -26,7 +22,7 @@ SHIPPED_MODEL = Path(__file__).parent / "models" / "classifier.onnx"
 class Engine:
     """A loaded network and its detector, shared by all sessions of a process."""
 
-    def __init__(self, detector: LaneDetector, network: Network) -> None:
+    def __init__(self, detector: CandidateDetector, network: Network) -> None:
         self.detector = detector
         self.network = network
 

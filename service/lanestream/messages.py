@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 _POINTS: Final = 24
 # Decimals that keep a curve exact to a hundredth of a pixel over the tallest image that is accepted.
-_ROW_DECIMALS: Final = 2
-_COEFFICIENT_DECIMALS: Final = (4, 7, 11)
+_HORIZON_DECIMALS: Final = 4
+_COEFFICIENT_DECIMALS: Final = (4, 7, 4)
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,9 @@ def lanes_message(frame: ProcessedFrame, *, seq: int, timestamp: float, dropped:
 
 def _lane(lane: LaneBoundary) -> LaneModel:
     points = _points(lane)
-    row = round(lane.curve.row, _ROW_DECIMALS)
-    c0, c1, c2 = (
+    v, b, k = (
         round(value, decimals)
-        for value, decimals in zip(lane.curve.moved_to(row).coefficients, _COEFFICIENT_DECIMALS, strict=True)
+        for value, decimals in zip(lane.curve.coefficients, _COEFFICIENT_DECIMALS, strict=True)
     )
     return LaneModel(
         track_id=lane.track_id,
@@ -66,8 +65,8 @@ def _lane(lane: LaneBoundary) -> LaneModel:
         probability=round(lane.probability, 4),
         points=points,
         line=LineModel(bottom=points[0], top=points[-1]),
-        row=row,
-        coefficients=(c0, c1, c2),
+        horizon=round(lane.curve.horizon, _HORIZON_DECIMALS),
+        coefficients=(v, b, k),
         covariance=_significant(lane.covariance),
         age_s=round(lane.age_s, 3),
     )

@@ -195,7 +195,11 @@ def error_message(error: BaseException, *, seq: int | None = None, fatal: bool =
     if isinstance(error, LanestreamError):
         return ErrorMessage(code=error.code, message=error.message, hint=error.hint, seq=seq, fatal=fatal)
     return ErrorMessage(
-        code=LanestreamError.code, message="something went wrong in the service", hint="see its log", seq=seq, fatal=fatal
+        code=LanestreamError.code,
+        message="something went wrong in the service",
+        hint="see its log",
+        seq=seq,
+        fatal=fatal,
     )
 
 

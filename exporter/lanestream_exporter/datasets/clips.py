@@ -1,4 +1,4 @@
-"""Labels of video clips: one JSON object a key frame, as in the data folder's description and as `scene` writes them."""
+"""Labels of video clips: one JSON object a key frame, the form that `lanestream scene` writes too."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _CLIPS: dict[Split, tuple[str, ...]] = {
 }
 
 # The country road is one drive: cut by time, with the stretch between two parts left out of neither but never shared.
-_COUNTRY_FRAMES: dict[Split, range] = {"train": range(0, 2000), "val": range(2000, 2400), "test": range(2400, 2800)}
+_COUNTRY_FRAMES: dict[Split, range] = {"train": range(2000), "val": range(2000, 2400), "test": range(2400, 2800)}
 
 
 def data_root() -> Path:

@@ -7,14 +7,13 @@ makes network inputs from an image, `finish` makes detections from the network's
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from lanestream.geometry import RoadView
-    from lanestream.lanes import Candidate, Detection, Image
+from lanestream.geometry import RoadView
+from lanestream.lanes import Candidate, Detection, Image
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from lanestream.detection.vanishing import VanishingPointSearch
 from lanestream.geometry import RoadView, Scaling, visible_rows
 from lanestream.lanes import Candidate, Curve, Image
 
-# Candidates reach from the bottom up to this share of the depth below the horizon. Nearer to the horizon a lane is a few
-# pixels wide and every line looks like every other.
+# Candidates reach from the bottom up to this share of the depth below the horizon. Nearer to the horizon a lane is a
+# few pixels wide and every line looks like every other.
 TOP_SHARE = 0.1
 
 # The two rows, as shares of the depth, at which lines are told, compared and suppressed.

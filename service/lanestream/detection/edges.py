@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.geometry import Scaling
 from lanestream.lanes import Image
-
-if TYPE_CHECKING:
-    from lanestream.geometry import Scaling
 
 WORKING_WIDTH = 640
 

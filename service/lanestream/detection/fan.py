@@ -1,23 +1,20 @@
 """Lines through the vanishing point, found in one dimension.
 
 Seen along the rays that leave the vanishing point, a flat road has constant lane widths and constant marking widths. So
-the road is warped to (row, slope) once; there a marking is a vertical bar of known width, a box filter finds it, and the
-mean over the rows gathers what dashes and dots leave, which edges alone would not.
+the road is warped to (row, slope) once; there a marking is a vertical bar of known width, a box filter finds it, and
+the mean over the rows gathers what dashes and dots leave, which edges alone would not.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.detection.perspective import Perspective
 from lanestream.lanes import Image
-
-if TYPE_CHECKING:
-    from lanestream.detection.perspective import Perspective
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,20 @@
 """The extended Hough transform: lines from edge pixels that vote only near their gradient's direction.
 
-The angle axis covers the full circle, so the two edges of a marking, whose gradients are opposite, are peaks 180 degrees
-apart and can be told from each other. Sources: F. O'Gorman and M. B. Clowes, "Finding picture edges through collinearity
-of feature points", 1976 (votes limited by the gradient); T. Petkovic and S. Loncaric, arXiv 1510.04863 (the full circle).
+The angle axis covers the full circle, so the two edges of a marking, whose gradients are opposite, are peaks 180
+degrees apart and can be told from each other. Sources: F. O'Gorman and M. B. Clowes, "Finding picture edges through
+collinearity of feature points", 1976 (votes limited by the gradient); T. Petkovic and S. Loncaric, arXiv 1510.04863
+(the full circle).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from lanestream.detection.edges import Edges
+from lanestream.detection.edges import Edges
 
 _CIRCLE = 360
 
@@ -89,7 +88,7 @@ class ExtendedHough:
         """(rho index, theta in degrees, votes) of the strongest local maxima, to a fraction of a cell."""
         pad = 3
         wrapped = np.hstack([accumulator[:, -pad:], accumulator, accumulator[:, :pad]])
-        smooth = cv2.GaussianBlur(wrapped, (3, 3), 0.7)
+        smooth = np.asarray(cv2.GaussianBlur(wrapped, (3, 3), 0.7), dtype=np.float32)
         highest = cv2.dilate(smooth, np.ones((5, 5), np.uint8))
         is_peak = (smooth == highest) & (smooth >= self.min_votes)
         is_peak[:, :pad] = is_peak[:, -pad:] = False

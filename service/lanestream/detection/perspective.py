@@ -19,7 +19,10 @@ from lanestream.lanes import Image
 
 @dataclass(frozen=True)
 class Perspective:
-    """`x`, `y`: the vanishing point in pixels; `bend`: k over the squared depth of the road; `weight`: evidence, 0 to 1."""
+    """The vanishing point (`x`, `y`) in pixels, and `bend`, which is k over the squared depth of the road.
+
+    `weight` (0 to 1) tells how much of the frame's evidence speaks for it.
+    """
 
     x: float
     y: float
@@ -58,7 +61,7 @@ def find_ridges(grey: Image, horizon: float, width: float = 0.1, limit: int = 16
         start = np.clip(x[None, :] + (shift - half)[:, None], 0, columns - 1)
         stop = np.clip(x[None, :] + (shift + half)[:, None] + 1, 1, columns)
         area = np.take_along_axis(total, stop, axis=1) - np.take_along_axis(total, start, axis=1)
-        return (area / np.maximum(stop - start, 1)).astype(np.float32)
+        return np.asarray(area / np.maximum(stop - start, 1), dtype=np.float32)
 
     sides = 2 * half + 1
     ridge = mean(np.zeros_like(half)) - np.maximum(mean(-sides), mean(sides))
@@ -75,8 +78,9 @@ class PerspectiveSearch:
     """Coarse to fine around a first guess.
 
     `spread_x` and `spread_y` are how far the vanishing point may lie from the guess, in image widths, and `spread_bend`
-    the strongest bend; of a horizon that is known, the row is only `nod` away, as a camera nods on its wheels. Ridges gather in cells of `cell` image widths on the bottom row; `prior` is the share of the best
-    score that a hypothesis at the end of its spread must make up for.
+    the strongest bend; of a horizon that is known, the row is only `nod` away, as a camera nods on its wheels. Ridges
+    gather in cells of `cell` image widths on the bottom row; `prior` is the share of the best score that a hypothesis
+    at the end of its spread must make up for.
     """
 
     spread_x: float = 0.12

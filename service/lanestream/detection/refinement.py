@@ -84,7 +84,7 @@ class Refinement:
         contrast = mean - np.maximum(sides[:, : -2 * shift], sides[:, 2 * shift :])
         # Five grey levels above its own row's unrest is a bar that an eye would see.
         unrest = np.abs(contrast).mean(axis=1, keepdims=True)
-        return np.clip((contrast - unrest) / (unrest + 5.0), 0.0, 1.0).astype(np.float32)
+        return np.asarray(np.clip((contrast - unrest) / (unrest + 5.0), 0.0, 1.0), dtype=np.float32)
 
     def _fit(self, candidate: Candidate, strip: NDArray[np.float32], view: RoadView) -> Fit:
         """Columns at the anchor rows by least squares with the candidate as the prior."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from lanestream.detection.hough import HoughLines
+from lanestream.detection.hough import HoughLines
 
 
 @dataclass(frozen=True)
@@ -35,9 +33,7 @@ class VanishingPointSearch:
     middle: float = 0.46
     spread: float = 0.16
 
-    def find(
-        self, lines: HoughLines, width: int, height: int, horizon: float | None = None
-    ) -> VanishingPoint:
+    def find(self, lines: HoughLines, width: int, height: int, horizon: float | None = None) -> VanishingPoint:
         """The vanishing point of `lines` in a `width` x `height` image; on the row `horizon` where that is known."""
         if len(lines) < 2:
             return VanishingPoint((width - 1) / 2.0, self._row(height, horizon), 0.0)

@@ -49,4 +49,6 @@ class ModelInfo(BaseModel):
         except ValidationError as error:
             problem = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in problem["loc"]) or METADATA_KEY
-            raise ModelError(f"{source} has a description that is not understood: {where}: {problem['msg']}", hint) from None
+            raise ModelError(
+                f"{source} has a description that is not understood: {where}: {problem['msg']}", hint
+            ) from None

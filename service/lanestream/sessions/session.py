@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import LaneDetector, Prepared
-from lanestream.lanes import FrameResult
+from lanestream.lanes import FrameResult, Image
 from lanestream.tracking import LaneTracker
 
-if TYPE_CHECKING:
-    from lanestream.lanes import Image
-
 # The least that a new frame's horizon counts for the camera's: bumps should not move it, a minute of driving should.
-_HORIZON_GAIN = 0.04
+_HORIZON_GAIN = 0.1
 
 
 class Session:

@@ -15,9 +15,7 @@ from lanestream.tracking.track import Track
 GATE = 14.2
 
 
-def associate(
-    tracks: Sequence[Track], measured: Sequence[tuple[FloatArray, FloatArray]]
-) -> list[tuple[int, int]]:
+def associate(tracks: Sequence[Track], measured: Sequence[tuple[FloatArray, FloatArray]]) -> list[tuple[int, int]]:
     """(track, detection) index pairs for detections told as columns (3,) and their covariance (3, 3).
 
     The cost is the innovation's negative log likelihood, d^2 + ln det S; pairs outside the gate are impossible.

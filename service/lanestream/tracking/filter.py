@@ -1,19 +1,24 @@
 """The Kalman filter of one boundary: its columns at three fixed rows, and their velocities.
 
-Three rows tell the curve x(y) = v + b u + k / u; a straight boundary is one whose three columns are in line. The model is
-nearly constant velocity with the frames' own time steps (Y. Bar-Shalom et al., "Estimation with applications to tracking
-and navigation", 2001, section 6.2); the update is filterpy's, in Joseph form.
+Three rows tell the curve x(y) = v + b u + k / u; a straight boundary is one whose three columns are in line. The model
+is nearly constant velocity with the frames' own time steps (Y. Bar-Shalom et al., "Estimation with applications to
+tracking and navigation", 2001, section 6.2), its velocity fading as in section 8.2.3: no boundary keeps drifting
+unseen. The update is filterpy's, in Joseph form.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from lanestream.geometry import RoadView
 from lanestream.lanes import Curve, FloatArray, curve_basis
+
+# Seconds in which an unconfirmed velocity fades to a third.
+_FADING_S: Final = 0.4
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,9 @@ def boundary_filter(columns: FloatArray, covariance: FloatArray, speed: FloatArr
 def predict(kalman: KalmanFilter, seconds: float, acceleration: FloatArray) -> None:
     """Moves a filter on by `seconds`, with white `acceleration` (3,) in px/s^2 at its rows."""
     power = np.diag(acceleration**2)
-    kalman.F = np.block([[np.eye(3), seconds * np.eye(3)], [np.zeros((3, 3)), np.eye(3)]])
+    kept = float(np.exp(-seconds / _FADING_S))
+    travel = _FADING_S * (1.0 - kept)
+    kalman.F = np.block([[np.eye(3), travel * np.eye(3)], [np.zeros((3, 3)), kept * np.eye(3)]])
     kalman.Q = np.block(
         [[seconds**3 / 3.0 * power, seconds**2 / 2.0 * power], [seconds**2 / 2.0 * power, seconds * power]]
     )

@@ -21,9 +21,9 @@ class TrackerSettings:
     """A tracker's settings; lengths are shares of the depth of the road view unless said otherwise.
 
     Boundaries are followed at the depths `shares`, where they accelerate by about `acceleration` per second squared and
-    start with up to `speed` per second. A detection's own covariance is widened by `noise` and by a horizon that nods by
-    `nod`. A track is confirmed by `birth[0]` hits in `birth[1]` frames and coasts for `coast_s` seconds. Tracks of one
-    marking, nearer than `merge` lane widths, become one.
+    start with up to `speed` per second. A detection's own covariance is widened by `noise` and by a horizon that nods
+    by `nod`. A track is confirmed by `birth[0]` hits in `birth[1]` frames and coasts for `coast_s` seconds. Tracks of
+    one marking, nearer than `merge` lane widths, become one.
     """
 
     shares: tuple[float, float, float] = (1.0, 0.5, 0.2)
@@ -178,9 +178,7 @@ class LaneTracker:
     def _changes(
         self, tracks: Sequence[Track], columns: Sequence[float], view: RoadView, lane_width: float
     ) -> list[LaneChange]:
-        found = [
-            self._sides.update(t, c, _camera(view), lane_width) for t, c in zip(tracks, columns, strict=True)
-        ]
+        found = [self._sides.update(t, c, _camera(view), lane_width) for t, c in zip(tracks, columns, strict=True)]
         return [change for change in found if change is not None]
 
     def _boundary(self, track: Track, place: int, rows: tuple[float, float]) -> LaneBoundary:
@@ -199,9 +197,7 @@ class LaneTracker:
             age_s=self._clock - track.born,
         )
 
-    def _ego(
-        self, tracks: Sequence[Track], columns: Sequence[float], places: Sequence[int], view: RoadView
-    ) -> EgoLane:
+    def _ego(self, tracks: Sequence[Track], columns: Sequence[float], places: Sequence[int], view: RoadView) -> EgoLane:
         at = {place: index for index, place in enumerate(places)}
         left, right = at.get(-1), at.get(1)
         offset = None
