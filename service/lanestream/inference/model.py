@@ -74,8 +74,8 @@ class OnnxModel:
             self.run(np.zeros((batch, size, size, 3), np.uint8))
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Probabilities (N, classes) of RGB patches (N, size, size, 3); N may be 0 and may exceed the largest
-        bucket.""" parts = [self._padded(inputs[i : i + BUCKETS[-1]]) for i in range(0, len(inputs), BUCKETS[-1])]
+        """Probabilities (N, classes) of RGB patches (N, size, size, 3); any N, also 0 and beyond the largest bucket."""
+        parts = [self._padded(inputs[i : i + BUCKETS[-1]]) for i in range(0, len(inputs), BUCKETS[-1])]
         return np.concatenate(parts) if parts else np.zeros((0, len(self.info.classes)), np.float32)
 
     def _padded(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:

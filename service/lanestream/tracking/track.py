@@ -16,7 +16,8 @@ class Track:
     """A boundary with a past. Times are seconds on the tracker's own clock.
 
     `hits` remembers for the last frames whether a detection backed it. `side` is -1 left and +1 right of the camera;
-    `crossing` counts the frames in which it has been clearly on the other one.
+    `crossing` counts the frames in which it has been clearly on the other one. `previous_columns` are those of the frame
+    before.
     """
 
     kalman: KalmanFilter
@@ -30,10 +31,10 @@ class Track:
     track_id: int | None = None
     crossing: int = 0
     detected: bool = True
-    predicted_columns: FloatArray = field(init=False)
+    previous_columns: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.predicted_columns = self.kalman.x[:3].copy()
+        self.previous_columns = self.kalman.x[:3].copy()
 
     @property
     def confirmed(self) -> bool:

@@ -61,6 +61,7 @@ class LaneTracker:
         """
         rows = self._rows_for(view)
         self._predict(self._elapsed(timestamp), view)
+        self._forget()
         measured = [self._measured(detection, rows, view) for detection in detections]
         pairs = associate(self._tracks, measured)
         for i, j in pairs:
@@ -100,9 +101,15 @@ class LaneTracker:
     def _predict(self, seconds: float, view: RoadView) -> None:
         acceleration = self._scaled(self._settings.acceleration, view)
         for track in self._tracks:
+            track.previous_columns = track.columns.copy()
             # Beyond the coasting time a track dies anyway, and a long step would only overflow.
             predict(track.kalman, min(seconds, 2.0 * self._settings.coast_s), acceleration)
-            track.predicted_columns = track.columns.copy()
+
+    def _forget(self) -> None:
+        """Drops what a gap in the stream has made too old; with nothing left, the stream begins anew."""
+        self._tracks = [t for t in self._tracks if self._clock - t.last_hit <= self._settings.coast_s]
+        if not self._tracks:
+            self._frames = 0
 
     def _measured(self, detection: Detection, rows: Rows, view: RoadView) -> tuple[FloatArray, FloatArray]:
         """Columns of a detection and what they are worth: the fit, the eye, and the nodding horizon that moves all."""
@@ -112,14 +119,14 @@ class LaneTracker:
         return columns, covariance + noise + np.outer(nod, nod)
 
     def _shift_coasting(self, matched: set[int]) -> None:
-        """Moves unmatched tracks by what the matched ones have in common: the camera moved, not the road."""
-        moved = [t.columns - t.predicted_columns for i, t in enumerate(self._tracks) if i in matched and t.confirmed]
-        if not moved:
+        """Moves unmatched tracks as the matched ones have moved: it was the camera, not the road."""
+        seen = [t for i, t in enumerate(self._tracks) if i in matched and t.confirmed]
+        if not seen:
             return
-        shift = np.median(np.stack(moved), axis=0)
+        shift = np.median([track.columns - track.previous_columns for track in seen], axis=0)
         for i, track in enumerate(self._tracks):
             if i not in matched:
-                track.kalman.x[:3] += shift
+                track.kalman.x[:3] = track.previous_columns + shift
 
     def _new(self, detection: Detection, columns: FloatArray, noise: FloatArray, view: RoadView) -> Track:
         kalman = boundary_filter(columns, noise, self._scaled(self._settings.speed, view))
@@ -148,8 +155,7 @@ class LaneTracker:
         if not track.confirmed:
             misses = len(track.hits) - sum(track.hits)
             return misses <= self._settings.birth[1] - self._settings.birth[0]
-        uncertain = float(np.sqrt(track.kalman.P[0, 0])) > self._settings.merge * self._width.value * view.depth
-        return self._clock - track.last_hit <= self._settings.coast_s and not uncertain
+        return float(np.sqrt(track.kalman.P[0, 0])) <= self._settings.merge * self._width.value * view.depth
 
     def _merged(self, tracks: list[Track], view: RoadView) -> list[Track]:
         """Of tracks that have run together the oldest stays, with its identity."""
