@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
+import warnings
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -103,15 +105,19 @@ def export_classifier(
 
 def _to_onnx(served: ServedNetwork, path: Path) -> None:
     example = torch.zeros(2, INPUT_SIZE, INPUT_SIZE, 3, dtype=torch.uint8)
-    program = torch.onnx.export(
-        served,
-        (example,),
-        input_names=["patches"],
-        output_names=["probabilities"],
-        dynamic_shapes={"patches": {0: torch.export.Dim("batch", min=1, max=1024)}},
-        dynamo=True,
-        verbose=False,
-    )
+    # The exporter warns of its own innards and of torchvision's absence: nothing that a user could mend.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            served,
+            (example,),
+            input_names=["patches"],
+            output_names=["probabilities"],
+            dynamic_shapes={"patches": {0: torch.export.Dim("batch", min=1, max=1024)}},
+            dynamo=True,
+            verbose=False,
+        )
     assert program is not None  # noqa: S101 - dynamo=True always returns a program
     program.save(str(path), external_data=False)
 

@@ -31,7 +31,8 @@ class Fit:
 class Refinement:
     """The fit's settings; all widths are shares of the rows below the horizon, as everything on the road is.
 
-    The strip reaches `reach` to either side in `cells` cells on `rows` rows. The curve is told by its columns at the
+    The strip reaches `reach` to either side in `cells` cells on `rows` rows; markings are about as wide as one of `bars`.
+    The curve is told by its columns at the
     depths `anchors`, where the candidate may be off by about `doubt`. A bar's centre on one row is good to `noise`
     pixels of a 640 pixel wide image plus `blur` of the rows below the horizon.
     """
@@ -39,7 +40,7 @@ class Refinement:
     reach: float = 0.24
     cells: int = 97
     rows: int = 64
-    bar: float = 0.075
+    bars: tuple[float, ...] = (0.05, 0.1, 0.17)
     anchors: tuple[float, float, float] = (1.0, 0.45, 0.15)
     doubt: tuple[float, float, float] = (0.05, 0.03, 0.04)
     noise: float = 1.0
@@ -77,14 +78,17 @@ class Refinement:
         return self._bars(warped.astype(np.float32)).reshape(len(candidates), self.rows, self.cells)
 
     def _bars(self, warped: NDArray[np.float32]) -> NDArray[np.float32]:
-        width = max(1, round(self.bar / (2 * self.reach) * self.cells)) | 1
-        mean = cv2.blur(warped, (width, 1))
-        shift = round(1.3 * width)
-        sides = np.pad(mean, ((0, 0), (shift, shift)), mode="edge")
-        contrast = mean - np.maximum(sides[:, : -2 * shift], sides[:, 2 * shift :])
+        contrast = np.max([self._contrast(warped, bar) for bar in self.bars], axis=0)
         # Five grey levels above its own row's unrest is a bar that an eye would see.
         unrest = np.abs(contrast).mean(axis=1, keepdims=True)
         return np.asarray(np.clip((contrast - unrest) / (unrest + 5.0), 0.0, 1.0), dtype=np.float32)
+
+    def _contrast(self, warped: NDArray[np.float32], bar: float) -> NDArray[np.float32]:
+        """How much brighter a bar is than the brighter one of its neighbours of the same width."""
+        width = max(1, round(bar / (2 * self.reach) * self.cells)) | 1
+        mean = cv2.blur(warped, (width, 1))
+        sides = np.pad(mean, ((0, 0), (width, width)), mode="edge")
+        return np.asarray(mean - np.maximum(sides[:, : -2 * width], sides[:, 2 * width :]), dtype=np.float32)
 
     def _fit(self, candidate: Candidate, strip: NDArray[np.float32], view: RoadView) -> Fit:
         """Columns at the anchor rows by least squares with the candidate as the prior."""

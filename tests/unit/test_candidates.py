@@ -1,0 +1,99 @@
+"""Candidates and the detector on rendered scenes, whose boundaries are known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lanestream.detection.candidates import CandidateSearch
+from lanestream.detection.detector import CandidateDetector
+from lanestream.detection.strips import StripCutter
+from lanestream.geometry import RoadView
+from lanestream.lanes import Candidate, Curve
+from lanestream_exporter.boundaries import Found, Tally, count, ego_labels
+from lanestream_exporter.patches import TRUE, TruthRule
+from lanestream_exporter.scenes import Drive, RenderedFrame, render_still, sample_clip
+
+SIZES = [(320, 180), (640, 360), (640, 480), (480, 640), (1280, 720), (3840, 2160)]
+
+
+def fair_scene(width: int, height: int, seed: int = 24) -> RenderedFrame:
+    """A highway on a clear day."""
+    clip = sample_clip(np.random.default_rng(seed), width, height, frames=1, fps=25.0, drive=Drive("highway", fair=True))
+    return render_still(clip.scene_at(0))
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_ego_boundaries_are_proposed_at_any_size(width: int, height: int) -> None:
+    still = fair_scene(width, height)
+    proposals = CandidateSearch().propose(still.image)
+    assert 2 <= len(proposals.candidates) <= 16
+    assert proposals.view.horizon == pytest.approx(still.horizon, abs=0.04 * height)
+    rule = TruthRule(near=16.0)
+    for lane in ego_labels(still.labels):
+        alone = type(still.labels)(width, height, (lane,), "scene", "rendered", exhaustive=True)
+        assert TRUE in rule.judge(proposals.candidates, alone, proposals.view)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_an_oracle_network_gives_exact_boundaries(width: int, height: int) -> None:
+    """With the truth in the classifier's place, what is left is the geometry: refinement must be sub-pixel exact."""
+    still = fair_scene(width, height)
+    detector = CandidateDetector()
+    prepared = detector.prepare(still.image)
+    assert prepared.inputs.shape == (len(prepared.candidates), 224, 224, 3)
+    verdicts = TruthRule(near=16.0).judge(prepared.candidates, still.labels, prepared.view)
+    outputs = np.stack([verdicts != TRUE, verdicts == TRUE], axis=1).astype(np.float32)
+    found = [Found(d.curve, d.top, d.bottom, 0) for d in detector.finish(prepared, outputs)]
+    tally = Tally()
+    count(tally, found, ego_labels(still.labels), still.labels)
+    assert tally.missed == 0
+    assert tally.mean_error < 2.5
+
+
+def test_a_known_horizon_is_kept_but_for_a_nod() -> None:
+    still = fair_scene(640, 360)
+    for horizon in (still.horizon, still.horizon + 8.0):
+        assert CandidateSearch().propose(still.image, horizon).view.horizon == pytest.approx(horizon, abs=20.0)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((360, 640, 3), np.uint8),
+        np.full((360, 640, 3), 255, np.uint8),
+        np.random.default_rng(0).integers(0, 256, (360, 640, 3), dtype=np.uint8),
+        np.tile(np.linspace(0, 255, 640, dtype=np.uint8)[None, :, None], (360, 1, 3)),
+    ],
+    ids=["black", "white", "noise", "gradient"],
+)
+def test_images_without_a_road_do_no_harm(image: NDArray[np.uint8]) -> None:
+    detector = CandidateDetector()
+    prepared = detector.prepare(image)
+    accepted = np.tile(np.array([[0.0, 1.0]], np.float32), (len(prepared.candidates), 1))
+    for detection in detector.finish(prepared, accepted):
+        assert np.isfinite(detection.curve.coefficients).all()
+        assert np.isfinite(detection.covariance).all()
+
+
+def test_the_marking_stands_upright_in_its_patch() -> None:
+    image = np.full((360, 640, 3), 70, np.uint8)
+    curve = Curve(160.0, (320.0, 1.1, 0.0))
+    for y in range(170, 360):
+        half = 0.05 * (y - 160)
+        x = float(curve.x(y))
+        image[y, max(0, round(x - half)) : round(x + half) + 1] = 230
+    patch = StripCutter().cut(image, [Candidate(curve, 178.0, 359.0, 1.0)], RoadView(640, 360, 160.0))[0]
+    bright = patch[30:, :, 0] > 150
+    centres = np.array([np.flatnonzero(row).mean() for row in bright])
+    widths = bright.sum(axis=1)
+    np.testing.assert_allclose(centres, 111.5, atol=6.0)
+    np.testing.assert_allclose(widths[60:], 22.0, atol=6.0)
+
+
+def test_patches_are_rgb() -> None:
+    image = np.zeros((360, 640, 3), np.uint8)
+    image[:] = (10, 20, 200)  # red in BGR
+    patch = StripCutter().cut(image, [Candidate(Curve(160.0, (320.0, 0.0, 0.0)), 180.0, 359.0, 1.0)], RoadView(640, 360, 160.0))
+    assert tuple(patch[0, 100, 100]) == (200, 20, 10)
