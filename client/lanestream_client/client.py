@@ -62,8 +62,8 @@ class LaneClient:
     ) -> LaneStream:
         """The lanes of the frames of one camera, in their order, as they come.
 
-        Keeps a window of frames in flight: what the service grants in mode `all`, two in mode `latest`. A frame that
-        the service refuses gives a result with an `error`, and the stream goes on.
+        Keeps two frames in flight. A frame that the service refuses gives a result with an `error`, and the stream goes
+        on.
         """
         return LaneStream(self._endpoint, as_frames(frames), Conversation(mode, horizon), self._timeout)
 
@@ -114,7 +114,7 @@ def _connected(endpoint: Endpoint, timeout: float) -> Iterator[ClientConnection]
 
 
 class _Sender:
-    """A thread that sends frames while there is room for them, and `end` after the last; and the lock around both ways."""
+    """A thread that sends frames while there is room, and `end` after the last; and the lock around both ways."""
 
     def __init__(self, socket: ClientConnection, conversation: Conversation, frames: Iterator[SourceFrame]) -> None:
         self._socket = socket

@@ -1,7 +1,7 @@
 """The client's side of a stream, without its socket: shared by the client that blocks and the one that awaits.
 
-Keeps a window of frames in flight: as many as the service grants in mode `all`, two in mode `latest`, one being worked
-on and one on its way, so that none has to be dropped of a source that can wait.
+Keeps two frames in flight, one being worked on and one on its way: more would only wait in the service, and make every
+answer older. None has to be dropped of a source that can wait.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lanestream_client.frames import SourceFrame, StreamResult
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
 
-_LATEST_WINDOW: Final = 2
+_WINDOW: Final = 2
 _TOO_BIG: Final = 1009
 
 
@@ -74,7 +74,7 @@ class Conversation:
         """Whether one more frame may be sent now."""
         if self.ready is None:
             return False
-        window = self.ready.limits.credits if self._mode == "all" else _LATEST_WINDOW
+        window = min(_WINDOW, self.ready.limits.credits)
         return sum(pending.refused is None for pending in self._pending.values()) < window
 
     def outgoing(self, frame: SourceFrame, data: bytes) -> list[str | bytes]:

@@ -1,4 +1,4 @@
-"""Requests and answers of `/v1/detect`, without their transport: shared by the client that blocks and the one that awaits."""
+"""Requests and answers of `/v1/detect` without their transport, shared by the blocking and the awaiting client."""
 
 from __future__ import annotations
 

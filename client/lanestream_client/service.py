@@ -1,4 +1,4 @@
-"""What finds lanes: the service behind a URL, or an engine in this process. Commands and callers need not know which."""
+"""What finds lanes: the service behind a URL, or an engine in this process. Callers need not know which."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def _video_stream(container: av.container.OutputContainer, image: Image) -> av.V
 
 
 def _fitted(image: Image, width: int, height: int) -> Image:
-    """The image scaled to fit, where it is larger or much smaller, and its edges repeated to fill `width` x `height`."""
+    """The image scaled to fit, where its size is another, and its edges repeated to fill `width` x `height`."""
     import cv2
     import numpy as np
 

@@ -109,7 +109,6 @@ def _video(place: str, name: str) -> Iterator[Source]:
 
 def _decoded(container: av.container.InputContainer, name: str, fps: float) -> Iterator[SourceFrame]:
     import av
-    import cv2
 
     seq = 0
     try:
@@ -142,7 +141,9 @@ def _camera(number: int) -> Iterator[Source]:
     try:
         if not capture.isOpened():
             raise SourceError(f"there is no camera {number}, or another program has it", f"{_KINDS} is accepted")
-        yield Source(f"camera {number}", _captured(capture, number), live=True, fps=capture.get(cv2.CAP_PROP_FPS) or 30.0)
+        yield Source(
+            f"camera {number}", _captured(capture, number), live=True, fps=capture.get(cv2.CAP_PROP_FPS) or 30.0
+        )
     finally:
         capture.release()
 

@@ -23,7 +23,7 @@ from lanestream.lanes import FrameResult, Image
 from lanestream_exporter.boundaries import Found, Tally, count, ego_labels
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.splits import Split, labelled_clips, real_frames
+from lanestream_exporter.datasets.splits import LabelledClip, Split, labelled_clips, real_frames
 from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, TruthRule, distance_along
 
 
@@ -91,13 +91,14 @@ class Evaluation:
 
     def clips(self, root: Path, split: Split) -> dict[str, Any]:
         """The labelled clips of `split` frame after frame with the tracker: level B."""
-        return {labels.stem: self._clip(video, labels, frames) for video, labels, frames in labelled_clips(root, split)}
+        return {clip.name: self.clip(clip) for clip in labelled_clips(root, split)}
 
-    def _clip(self, video: Path, labels: Path, frames: range) -> dict[str, Any]:
-        wanted = read_clip_labels(labels)
+    def clip(self, clip: LabelledClip) -> dict[str, Any]:
+        """One labelled clip with the tracker, every frame of it in order: level B at its labelled frames."""
+        wanted = read_clip_labels(clip.labels)
         session = self._engine.open_session()
         ego, every, both, seen = Tally(), Tally(), 0, 0
-        for index, image, timestamp in _decoded(video, frames):
+        for index, image, timestamp in _decoded(clip.video, clip.frames):
             result = self._engine.process(session, image, timestamp)
             both += result.ego.left is not None and result.ego.right is not None
             seen += 1

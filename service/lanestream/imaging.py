@@ -92,7 +92,9 @@ def read_header(data: bytes) -> Header:
             try:
                 return read(data)
             except IndexError:
-                raise ImageError(f"the {kind} image is cut short: its header is missing", "send the whole file") from None
+                raise ImageError(
+                    f"the {kind} image is cut short: its header is missing", "send the whole file"
+                ) from None
     raise ImageError(f"not an image: {_describe(data)}", ACCEPTED)
 
 

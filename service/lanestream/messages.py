@@ -55,8 +55,7 @@ def lanes_message(frame: ProcessedFrame, *, seq: int, timestamp: float, dropped:
 def _lane(lane: LaneBoundary) -> LaneModel:
     points = _points(lane)
     v, b, k = (
-        round(value, decimals)
-        for value, decimals in zip(lane.curve.coefficients, _COEFFICIENT_DECIMALS, strict=True)
+        round(value, decimals) for value, decimals in zip(lane.curve.coefficients, _COEFFICIENT_DECIMALS, strict=True)
     )
     return LaneModel(
         track_id=lane.track_id,
@@ -84,6 +83,4 @@ def _significant(matrix: FloatArray) -> list[list[float]]:
 
 def _ego(result: FrameResult) -> EgoModel:
     offset = result.ego.offset
-    return EgoModel(
-        left=result.ego.left, right=result.ego.right, offset=None if offset is None else round(offset, 4)
-    )
+    return EgoModel(left=result.ego.left, right=result.ego.right, offset=None if offset is None else round(offset, 4))

@@ -40,7 +40,7 @@ class FrameMessage(Message):
 
     type: Literal["frame"] = "frame"
     seq: Annotated[int, Field(ge=0)] | None = None
-    timestamp: Annotated[float, Field(allow_inf_nan=False)] | None = Field(
+    timestamp: Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)] | None = Field(
         default=None, description="Capture time in seconds; any clock that does not go backwards."
     )
 
@@ -94,6 +94,12 @@ class LaneModel(Message):
     coefficients: tuple[float, float, float]
     covariance: list[list[float]] = Field(description="3 x 3, of the coefficients.")
     age_s: float
+
+    def x(self, y: float) -> float:
+        """The boundary's column at row `y`; nearer than one row to the horizon counts as one row."""
+        v, b, k = self.coefficients
+        u = max(y - self.horizon, 1.0)
+        return v + b * u + k / u
 
 
 class EgoModel(Message):

@@ -20,7 +20,9 @@ SIZES = [(320, 180), (640, 360), (640, 480), (480, 640), (1280, 720), (3840, 216
 
 def fair_scene(width: int, height: int, seed: int = 24) -> RenderedFrame:
     """A highway on a clear day."""
-    clip = sample_clip(np.random.default_rng(seed), width, height, frames=1, fps=25.0, drive=Drive("highway", fair=True))
+    clip = sample_clip(
+        np.random.default_rng(seed), width, height, frames=1, fps=25.0, drive=Drive("highway", fair=True)
+    )
     return render_still(clip.scene_at(0))
 
 
@@ -95,5 +97,7 @@ def test_the_marking_stands_upright_in_its_patch() -> None:
 def test_patches_are_rgb() -> None:
     image = np.zeros((360, 640, 3), np.uint8)
     image[:] = (10, 20, 200)  # red in BGR
-    patch = StripCutter().cut(image, [Candidate(Curve(160.0, (320.0, 0.0, 0.0)), 180.0, 359.0, 1.0)], RoadView(640, 360, 160.0))
+    patch = StripCutter().cut(
+        image, [Candidate(Curve(160.0, (320.0, 0.0, 0.0)), 180.0, 359.0, 1.0)], RoadView(640, 360, 160.0)
+    )
     assert tuple(patch[0, 100, 100]) == (200, 20, 10)

@@ -60,9 +60,7 @@ def checkpoint(network: AlexNet, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @torch.inference_mode()
-def test_folding_keeps_the_function_and_leaves_the_plain_topology(
-    network: AlexNet, patches: NDArray[np.uint8]
-) -> None:
+def test_folding_keeps_the_function_and_leaves_the_plain_topology(network: AlexNet, patches: NDArray[np.uint8]) -> None:
     plain = network.folded()
     x = normalise(torch.from_numpy(patches[:4]))
     torch.testing.assert_close(plain(x), network(x), rtol=1e-3, atol=1e-4)
@@ -149,7 +147,9 @@ def _other_network(_: export.ServedNetwork, path: Path) -> None:
     shape = helper.make_node("Shape", ["patches"], ["shape"], start=0, end=1)
     two = helper.make_node("Constant", [], ["two"], value_ints=[2])
     both = helper.make_node("Concat", ["shape", "two"], ["size"], axis=0)
-    ones = helper.make_node("ConstantOfShape", ["size"], ["probabilities"], value=helper.make_tensor("v", 1, [1], [1.0]))
+    ones = helper.make_node(
+        "ConstantOfShape", ["size"], ["probabilities"], value=helper.make_tensor("v", 1, [1], [1.0])
+    )
     graph = helper.make_graph(
         [shape, two, both, ones],
         "certain",

@@ -168,12 +168,16 @@ def test_a_bend_is_followed() -> None:
     np.testing.assert_allclose(result.lanes[1].curve.x(rows), detection(1.15, k=900.0).curve.x(rows), atol=1.0)
 
 
-@pytest.mark.parametrize("times", [[0.0, 0.04, 0.04, 0.04], [5.0, 4.0, 3.0, 2.0], [0.0, 1e6, 2e6, 3e6], [-3.0, -2.96, 0.0, 1e-9]])
+@pytest.mark.parametrize(
+    "times", [[0.0, 0.04, 0.04, 0.04], [5.0, 4.0, 3.0, 2.0], [0.0, 1e6, 2e6, 3e6], [-3.0, -2.96, 0.0, 1e-9]]
+)
 def test_odd_timestamps_do_no_harm(times: list[float]) -> None:
     tracker = LaneTracker()
     for timestamp in times:
         result = tracker.update(road(0.0, (0, 1)), timestamp, VIEW)
-    assert all(np.isfinite(lane.covariance).all() and np.isfinite(lane.curve.coefficients).all() for lane in result.lanes)
+    assert all(
+        np.isfinite(lane.covariance).all() and np.isfinite(lane.curve.coefficients).all() for lane in result.lanes
+    )
 
 
 def test_after_a_long_gap_everything_starts_anew() -> None:

@@ -16,7 +16,7 @@ from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 
 
 def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, LabelledFrame]:
-    """Labelled frames by their index in the clip; `exhaustive` where the labels name every boundary that can be told.
+    """Labelled frames by their index in the clip; `exhaustive` says that the labels name all that can be told.
 
     Raises LabelError that names the file and the line.
     """
@@ -41,8 +41,9 @@ def _frame(record: dict[str, Any], path: Path, exhaustive: bool) -> LabelledFram
         )
         for lane in record["lanes"]
     )
-    source = f"{record.get('clip', path.stem)}#{record['frame']}"
-    return LabelledFrame(int(record["width"]), int(record["height"]), lanes, path.stem, source, exhaustive)
+    clip = str(record.get("clip", path.stem))
+    source = f"{clip}#{record['frame']}"
+    return LabelledFrame(int(record["width"]), int(record["height"]), lanes, Path(clip).stem, source, exhaustive)
 
 
 def read_clip(video: Path, labels: Path) -> Iterator[tuple[LabelledFrame, Image]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -43,17 +44,36 @@ def data_root() -> Path:
 def real_frames(root: Path, split: Split) -> Iterator[tuple[LabelledFrame, Image]]:
     """All labelled real frames of a split with their BGR images, drive after drive."""
     yield from read_tusimple(root / "tusimple", split)
-    for clip in _CLIPS[split]:
-        yield from read_clip(root / "udacity/clips" / f"{clip}.mp4", root / "udacity/labels" / f"{clip}.jsonl")
+    for name in _CLIPS[split]:
+        clip = highway_clip(root, name)
+        yield from read_clip(clip.video, clip.labels)
     yield from _country_frames(root / "udacity_ch2", _COUNTRY_FRAMES[split])
 
 
-def labelled_clips(root: Path, split: Split) -> Iterator[tuple[Path, Path, range]]:
-    """(video, labels, frames) of the clips of a split; `frames` is the stretch of the video that belongs to it."""
-    for clip in _CLIPS[split]:
-        yield root / "udacity/clips" / f"{clip}.mp4", root / "udacity/labels" / f"{clip}.jsonl", range(1_000_000)
+@dataclass(frozen=True)
+class LabelledClip:
+    """A video with key-frame labels, and the stretch of its frames that belongs to a split."""
+
+    name: str
+    video: Path
+    labels: Path
+    frames: range
+
+
+def highway_clip(root: Path, name: str) -> LabelledClip:
+    """One of the labelled highway clips, whole."""
+    folder = root / "udacity"
+    return LabelledClip(name, folder / "clips" / f"{name}.mp4", folder / "labels" / f"{name}.jsonl", range(1_000_000))
+
+
+def labelled_clips(root: Path, split: Split) -> list[LabelledClip]:
+    """The clips of a split: highways and the country road's stretch."""
     country = root / "udacity_ch2"
-    yield country / "country_road_140s.mp4", country / "labels.jsonl", _COUNTRY_FRAMES[split]
+    video, labels = country / "country_road_140s.mp4", country / "labels.jsonl"
+    return [
+        *(highway_clip(root, name) for name in _CLIPS[split]),
+        LabelledClip("country_road", video, labels, _COUNTRY_FRAMES[split]),
+    ]
 
 
 def _country_frames(root: Path, wanted: range) -> Iterator[tuple[LabelledFrame, Image]]:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import cv2
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
@@ -74,7 +73,12 @@ _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {"image/jpeg": _BINARY, "image/png": _BINARY, "image/webp": _BINARY, "multipart/form-data": _FORM},
+            "content": {
+                "image/jpeg": _BINARY,
+                "image/png": _BINARY,
+                "image/webp": _BINARY,
+                "multipart/form-data": _FORM,
+            },
         }
     },
 )
@@ -182,4 +186,6 @@ async def _limited(request: Request, most: int) -> AsyncGenerator[bytes]:
         except ClientDisconnect:
             raise ProtocolError("the client went away before the end of its request") from None
     if size > most:
-        raise ImageTooLargeError(f"the request has more than the {most:,} bytes that are accepted", "send a smaller JPEG")
+        raise ImageTooLargeError(
+            f"the request has more than the {most:,} bytes that are accepted", "send a smaller JPEG"
+        )

@@ -30,7 +30,7 @@ class CandidateDetector:
     search: CandidateSearch = CandidateSearch()
     cutter: StripCutter = StripCutter()
     refinement: Refinement = Refinement()
-    separation: float = 0.4
+    separation: float = 0.8
 
     def prepare(self, image: Image, horizon: float | None = None) -> Prepared:
         """Patches of the candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where known."""

@@ -13,9 +13,6 @@ from lanestream.lanes import Image
 
 WORKING_WIDTH = 640
 
-# Yellow paint differs from concrete in blue only where luminance hides it; red and green see both colours of paint.
-_PAINT_WEIGHTS = np.array([[0.0, 0.5, 0.5]], dtype=np.float32)
-
 
 @dataclass(frozen=True)
 class Edges:
@@ -32,9 +29,12 @@ class Edges:
 
 
 def paint_grey(image: Image) -> Image:
-    """A BGR image (H, W, 3) as grey levels (H, W) in which white and yellow paint are both bright."""
-    grey: Image = cv2.transform(image, _PAINT_WEIGHTS).reshape(image.shape[:2]).astype(np.uint8, copy=False)
-    return grey
+    """A BGR image (H, W, 3) as grey levels (H, W) in which white and yellow paint are both bright.
+
+    It is the mean of green and red: yellow differs from concrete in blue, which luminance would take into account.
+    """
+    green, red = cv2.extractChannel(image, 1), cv2.extractChannel(image, 2)
+    return np.asarray(cv2.addWeighted(green, 0.5, red, 0.5, 0.0), dtype=np.uint8)
 
 
 def resized(image: Image, scaling: Scaling) -> Image:

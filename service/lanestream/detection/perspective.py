@@ -49,7 +49,7 @@ class RidgePoints:
     weight: NDArray[np.float64]
 
 
-def find_ridges(grey: Image, horizon: float, width: float = 0.1, limit: int = 1600) -> RidgePoints:
+def find_ridges(grey: Image, horizon: float, width: float = 0.1, limit: int = 1000) -> RidgePoints:
     """The strongest local maxima of a bar filter that is `width` times the depth of each row wide, in a grey image."""
     height, columns = grey.shape
     rows = np.unique(np.linspace(horizon + 0.08 * (height - 1 - horizon), height - 1, 112).astype(int))

@@ -31,10 +31,10 @@ class Fit:
 class Refinement:
     """The fit's settings; all widths are shares of the rows below the horizon, as everything on the road is.
 
-    The strip reaches `reach` to either side in `cells` cells on `rows` rows; markings are about as wide as one of `bars`.
-    The curve is told by its columns at the
-    depths `anchors`, where the candidate may be off by about `doubt`. A bar's centre on one row is good to `noise`
-    pixels of a 640 pixel wide image plus `blur` of the rows below the horizon.
+    The strip reaches `reach` to either side in `cells` cells on `rows` rows; markings are about as wide as one of
+    `bars`. The curve is told by its columns at the depths `anchors`, where the candidate may be off by about `doubt`. A
+    bar's centre on one row is good to `noise` pixels of a 640 pixel wide image plus `blur` of the rows below the
+    horizon.
     """
 
     reach: float = 0.24

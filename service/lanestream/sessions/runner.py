@@ -73,9 +73,7 @@ class FrameRunner:
         self._inference.shutdown(cancel_futures=True)
 
     @staticmethod
-    async def _timed(
-        threads: ThreadPoolExecutor, step: Callable[P, T], *args: P.args, **kwargs: P.kwargs
-    ) -> Timed[T]:
+    async def _timed(threads: ThreadPoolExecutor, step: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Timed[T]:
         def timed() -> Timed[T]:
             started = time.monotonic()
             value = step(*args, **kwargs)

@@ -25,12 +25,12 @@ class IncomingFrame:
 class StreamRules:
     """One stream from its opening to its summary; `now` is always the time on one monotonic clock, in seconds.
 
-    In mode `latest` one frame waits at most, and a newer one takes its place. In mode `all` up to `credits` frames may
-    be unanswered at a time, none is dropped, and one more is an error.
+    In mode `latest` one frame waits at most, and a newer one takes its place. In mode `all` up to `most_unanswered`
+    frames may be unanswered at a time, none is dropped, and one more is an error.
     """
 
-    def __init__(self, credits: int, now: float) -> None:
-        self._credits = credits
+    def __init__(self, most_unanswered: int, now: float) -> None:
+        self._most_unanswered = most_unanswered
         self._opened_at = now
         self._options: StartMessage | None = None
         self._announced: FrameMessage | None = None
@@ -85,10 +85,10 @@ class StreamRules:
         self._refuse_after_end("an image")
         self._options = self.options
         unanswered = len(self._waiting) + self._busy
-        if self.mode == "all" and unanswered >= self._credits:
+        if self.mode == "all" and unanswered >= self._most_unanswered:
             raise OverrunError(
                 f"{unanswered} frames are unanswered and one more came",
-                f"mode `all` grants {self._credits} unanswered frames; wait for answers, or use mode `latest`",
+                f"mode `all` grants {self._most_unanswered} of them; wait for answers, or use mode `latest`",
             )
         if self.mode == "latest" and self._waiting:
             self._waiting.clear()

@@ -16,8 +16,8 @@ class Track:
     """A boundary with a past. Times are seconds on the tracker's own clock.
 
     `hits` remembers for the last frames whether a detection backed it. `side` is -1 left and +1 right of the camera;
-    `crossing` counts the frames in which it has been clearly on the other one. `previous_columns` are those of the frame
-    before.
+    `crossing` counts the frames in which it has been clearly on the other one. `previous_columns` are those of
+    the frame before.
     """
 
     kalman: KalmanFilter

@@ -1,0 +1,45 @@
+# Each target does its own set-up: on a fresh machine `make demo` and `make test` need only Python 3.11 or later.
+
+PYTHON ?= $(shell command -v python3.13 || command -v python3.12 || command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+VIDEO ?=
+
+# What an environment was last set up for; pyproject.toml is what it depends on.
+RUN_READY := $(VENV)/.ready-run
+DEV_READY := $(VENV)/.ready-dev
+
+.PHONY: demo serve test lint picture clean
+
+demo: $(RUN_READY)
+	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
+
+serve: $(RUN_READY)
+	$(BIN)/lanestream serve
+
+test: $(DEV_READY)
+	$(BIN)/python -m pytest
+
+lint: $(DEV_READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+picture: $(RUN_READY)
+	$(BIN)/python tools/picture.py docs/lanes.jpg
+
+clean:
+	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+$(VENV)/bin/python:
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: Python 3.11 or later is needed, $(PYTHON) is older (set PYTHON=...)" >&2; exit 1; }
+	"$(PYTHON)" -m venv $(VENV) || { echo "error: no venv module (on Debian: apt install python3-venv)" >&2; exit 1; }
+
+$(RUN_READY): pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,video]'
+	@touch $@
+
+$(DEV_READY): pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,train,dev]'
+	@touch $@ $(RUN_READY)

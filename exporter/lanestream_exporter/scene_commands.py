@@ -1,0 +1,63 @@
+"""The command `scene`: a rendered clip with its labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from lanestream_exporter.scenes import Drive, sample_clip, write_clip
+
+
+class SizeType(click.ParamType[tuple[int, int]]):
+    """WIDTHxHEIGHT in pixels, both even, as video wants them."""
+
+    name = "WIDTHxHEIGHT"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """The two numbers; fails with what is accepted."""
+        try:
+            width, height = (int(part) for part in str(value).lower().split("x"))
+        except ValueError:
+            self.fail(f"{value!r} is no size; 1280x720 would be one", param, ctx)
+        if not (320 <= width <= 3840 and 180 <= height <= 2160) or width % 2 or height % 2:
+            self.fail(f"{value!r} is refused; even numbers from 320x180 to 3840x2160 are accepted", param, ctx)
+        return width, height
+
+
+@click.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--seed", default=24, show_default=True, help="Another seed, another road.")
+@click.option("--seconds", default=8.0, show_default=True, type=click.FloatRange(0.1, 600.0))
+@click.option("--fps", default=25.0, show_default=True, type=click.FloatRange(1.0, 120.0))
+@click.option("--size", default="1280x720", show_default=True, type=SizeType())
+@click.option(
+    "--style", default="highway", show_default=True, type=click.Choice(["highway", "country", "street", "lane"])
+)
+@click.option("--any-weather", is_flag=True, help="Also night, rain, fog and dirt, as they come; else a clear day.")
+@click.option("--lane-change", is_flag=True, help="The camera changes lanes on the way.")
+@click.option("--labels", type=click.Path(path_type=Path), help="Labels file. [default: OUT with the suffix .jsonl]")
+def scene(
+    out: Path,
+    seed: int,
+    seconds: float,
+    fps: float,
+    size: tuple[int, int],
+    style: Any,
+    any_weather: bool,
+    lane_change: bool,
+    labels: Path | None,
+) -> None:
+    """Render a drive to the video OUT, with the exact labels of every frame."""
+    drive = Drive(style, lane_change=lane_change, fair=not any_weather)
+    frames = max(1, round(seconds * fps))
+    clip = sample_clip(np.random.default_rng(seed), *size, frames=frames, fps=fps, drive=drive)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("rendering", total=frames)
+        write_clip(clip, out, labels or out.with_suffix(".jsonl"), lambda done, _: bar.update(task, completed=done))

@@ -1,0 +1,77 @@
+"""`make demo`: a clip through a service of its own, as a user would send it; results under out/.
+
+Without a video it renders one. The service runs on a free port, is waited for until it is ready, and is stopped whatever
+happens.
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+
+OUT = Path("out")
+LANESTREAM = Path(sys.executable).with_name("lanestream")
+READY_S = 60.0
+
+
+def main(video: str | None) -> int:
+    """Runs the demo; the exit code is that of the stream."""
+    OUT.mkdir(exist_ok=True)
+    if video is None:
+        video = str(OUT / "scene.mp4")
+        print(f"rendering {video}", flush=True)
+        subprocess.run([LANESTREAM, "scene", video, "--lane-change"], check=True)
+    name = Path(video).stem
+    results, annotated = OUT / f"{name}.lanes.jsonl", OUT / f"{name}.annotated.mp4"
+    with service() as url:
+        command = [LANESTREAM, "stream", video, "--url", url, "--mode", "all"]
+        code = subprocess.run([*command, "--jsonl", results, "--video", annotated], check=False).returncode
+    if code == 0:
+        print(f"wrote      {annotated}\n           {results}")
+    return code
+
+
+@contextmanager
+def service() -> Iterator[str]:
+    """A service on a free port, by its URL; its log goes to out/service.log."""
+    port = free_port()
+    url = f"http://127.0.0.1:{port}"
+    with (OUT / "service.log").open("w") as log:
+        process = subprocess.Popen([LANESTREAM, "serve", "--port", str(port)], stdout=log, stderr=log)
+        try:
+            wait_until_ready(process, url)
+            yield url
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(timeout=30)
+
+
+def wait_until_ready(process: subprocess.Popen[bytes], url: str) -> None:
+    """Returns when the network is warm; exits with what the service said where it does not come up."""
+    end = time.monotonic() + READY_S
+    while time.monotonic() < end and process.poll() is None:
+        try:
+            if httpx.get(f"{url}/readyz").is_success:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.1)
+    sys.exit(f"error: the service did not come up:\n{(OUT / 'service.log').read_text()}")
+
+
+def free_port() -> int:
+    """A port that nobody listens on just now."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1] if len(sys.argv) > 1 else None))
