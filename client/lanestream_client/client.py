@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -89,7 +89,7 @@ class LaneStream:
         """The service's final count; None before the end."""
         return self._conversation.summary
 
-    def __iter__(self) -> Iterator[StreamResult]:
+    def __iter__(self) -> Generator[StreamResult]:
         conversation = self._conversation
         with _connected(self._endpoint, self._timeout) as socket:
             socket.send(conversation.opening())

@@ -5,9 +5,8 @@ Whoever mounts them gives the way to load an engine of this process as the conte
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,9 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lanestream.errors import ImageError, SettingsError, SourceError
+from lanestream.errors import ImageError, SourceError, needs_extra
 from lanestream_client.client import LaneClient
+from lanestream_client.frames import SourceFrame
 from lanestream_client.in_process import InProcess, LocalEngine
 from lanestream_client.live import NewestFrames
 from lanestream_client.report import Tally
@@ -26,7 +26,7 @@ from lanestream_client.sources import image_files, open_source
 
 if TYPE_CHECKING:
     from lanestream.protocol import LanesMessage, Mode
-    from lanestream_client.frames import SourceFrame, StreamResult
+    from lanestream_client.frames import StreamResult
     from lanestream_client.service import LaneService
     from lanestream_client.sinks import JsonLines, VideoSink
     from lanestream_client.sources import Source
@@ -66,6 +66,7 @@ def _service_options(command: _Command) -> _Command:
 @click.pass_context
 def detect(
     context: click.Context,
+    /,
     paths: tuple[Path, ...],
     horizon: float | None,
     jsonl: Path | None,
@@ -86,10 +87,10 @@ def detect(
                 tally.fail()
                 continue
             tally.answered(lanes)
-            if lines is not None:
-                lines.write(lanes, file=str(path))
             if lines is None:
                 click.echo(f"{path}: {_in_words(lanes)}")
+            else:
+                lines.write(lanes, file=str(path))
             if annotate is not None:
                 _annotate(path, lanes, annotate)
         click.echo(f"\n{tally.report(service.describe())}", err=_is_output(jsonl))
@@ -109,6 +110,7 @@ def detect(
 @click.pass_context
 def stream(
     context: click.Context,
+    /,
     source: str,
     horizon: float | None,
     jsonl: Path | None,
@@ -124,7 +126,120 @@ def stream(
     with ExitStack() as stack:
         camera = stack.enter_context(open_source(source, fps))
         service = stack.enter_context(_service(context.obj, **where))
-        outputs = _Outputs(stack.enter_context(json_lines(jsonl)), stack.enter_context(video_sink(video, camera.fps)))
-        interrupted = _run(service, camera, mode or ("latest" if camera.live else "all"), horizon, outputs)
-        click.echo(outputs.report(service), err=_is_output(jsonl))
+        lines = stack.enter_context(json_lines(jsonl))
+        outputs = _Outputs(lines, stack.enter_context(video_sink(video, camera.fps)))
+        interrupted = _follow(service, camera, outputs, mode or ("latest" if camera.live else "all"), horizon)
+        click.echo(outputs.tally.report(service.describe(), outputs.dropped), err=_is_output(jsonl))
     context.exit(_INTERRUPTED if interrupted else 0)
+
+
+class _Outputs:
+    """What is done with every result of a stream."""
+
+    def __init__(self, lines: JsonLines | None, video: VideoSink | None) -> None:
+        self.tally = Tally()
+        self.dropped = 0
+        self._lines = lines
+        self._video = video
+
+    def take(self, result: StreamResult) -> None:
+        """Counts a result, and writes it to where it was asked to go."""
+        if result.lanes is not None:
+            self.tally.answered(result.lanes)
+        elif result.error is not None:
+            self.tally.fail()
+            click.echo(f"frame {result.frame.seq}: {result.error.message}", err=True)
+        message = result.lanes or result.error
+        if self._lines is not None and message is not None:
+            self._lines.write(message, **({"file": result.frame.name} if result.frame.name else {}))
+        if self._video is not None:
+            self._draw(result, self._video)
+
+    def _draw(self, result: StreamResult, video: VideoSink) -> None:
+        from lanestream_client.overlays import draw_error, draw_lanes
+
+        with suppress(ImageError):  # there is nothing to draw on
+            image = result.frame.image()
+            if result.lanes is not None:
+                image = draw_lanes(image, result.lanes)
+            elif result.error is not None:
+                image = draw_error(image, result.error)
+            video.write(image, result.frame.timestamp)
+
+
+def _follow(service: LaneService, camera: Source, outputs: _Outputs, mode: Mode, horizon: float | None) -> bool:
+    """Takes the camera's frames to `outputs`. True where the user broke it off, which is how a live one ends."""
+    with ExitStack() as stack:
+        advance = stack.enter_context(_progress("frames", camera.length))
+        newest = None
+        if camera.live and mode == "latest":
+            newest = stack.enter_context(NewestFrames(camera.frames))
+        results = service.stream(newest or camera.frames, mode=mode, horizon=horizon)
+        interrupted = False
+        try:
+            with closing(iter(results)) as each:
+                for result in each:
+                    outputs.take(result)
+                    advance()
+        except KeyboardInterrupt:
+            interrupted = True
+    outputs.dropped = (results.summary.dropped if results.summary else 0) + (newest.skipped if newest else 0)
+    return interrupted
+
+
+@contextmanager
+def _service(load: Load, url: str | None, model: Path | None, provider: str | None) -> Iterator[LaneService]:
+    if url is None:
+        yield InProcess(load(model, provider or "auto"))
+        return
+    if model is not None or provider is not None:
+        raise click.UsageError("--model and --provider are for work in this process; the service at --url has its own")
+    with LaneClient(url) as client:
+        yield client
+
+
+@contextmanager
+def _progress(what: str, length: int | None) -> Iterator[Callable[[], None]]:
+    """A bar on a terminal, nothing in a pipe; what it gives is called once a step."""
+    console = Console(stderr=True)
+    columns = [TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()]
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task(what, total=length)
+        yield lambda: bar.advance(task)
+
+
+def _files(paths: Sequence[Path]) -> list[Path]:
+    return [file for path in paths for file in (image_files(path) if path.is_dir() else [path])]
+
+
+def _detected(service: LaneService, path: Path, horizon: float | None) -> LanesMessage | None:
+    """The lanes of an image; None, with a line about why, where that image has none to give."""
+    try:
+        return service.detect(image_bytes(path), horizon=horizon)
+    except (ImageError, SourceError) as error:
+        click.echo(f"error: {path}: {error}", err=True)
+        return None
+
+
+def _in_words(lanes: LanesMessage) -> str:
+    sides = [side for side, track in (("left", lanes.ego.left), ("right", lanes.ego.right)) if track is not None]
+    ego = f"ego {' and '.join(sides)}" if sides else "no ego lane"
+    count = len(lanes.lanes)
+    return f"{count} {'boundary' if count == 1 else 'boundaries'}, {ego}, {lanes.timing_ms.total:.1f} ms"
+
+
+def _annotate(path: Path, lanes: LanesMessage, folder: Path) -> None:
+    with needs_extra("video"):
+        import cv2
+
+        from lanestream_client.overlays import draw_lanes
+    target = folder / f"{path.name}.lanes.jpg"
+    picture = draw_lanes(SourceFrame(0, None, data=path.read_bytes(), name=str(path)).image(), lanes)
+    folder.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(target), picture):
+        raise SourceError(f"can't write {target}")
+
+
+def _is_output(path: Path | None) -> bool:
+    """Whether the standard output carries JSON, and nothing else may be said there."""
+    return str(path) == "-"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -79,7 +79,7 @@ class LocalStream:
         self._clock = clock
         self.summary: SummaryMessage | None = None
 
-    def __iter__(self) -> Iterator[StreamResult]:
+    def __iter__(self) -> Generator[StreamResult]:
         started = self._clock()
         answered = failed = 0
         for frame in self._frames:

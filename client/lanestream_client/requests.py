@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -74,5 +75,5 @@ def reaching(place: str) -> Iterator[None]:
 
 def unreachable(place: str, error: Exception) -> ConnectionFailedError:
     """The error for a service that can't be reached."""
-    reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).removeprefix("[Errno 111] ")
+    reason = re.sub(r"^\[Errno -?\d+\] ", "", str(error)) or type(error).__name__
     return ConnectionFailedError(f"can't reach the service at {place}: {reason}", "start one with `lanestream serve`")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -27,7 +27,7 @@ class ResultStream(Protocol):
         """The final count; None until the stream came to its end."""
         ...
 
-    def __iter__(self) -> Iterator[StreamResult]: ...
+    def __iter__(self) -> Generator[StreamResult]: ...
 
 
 class LaneService(Protocol):

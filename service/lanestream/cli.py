@@ -1,58 +1,76 @@
-"""The command `lanestream`. Sub-commands live with what they drive and are imported only when they are called."""
+"""The command `lanestream`: serves, and mounts the commands of the client and of the exporter when they are called."""
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from lanestream import __version__
 from lanestream.errors import LanestreamError, needs_extra
 
-# Command: (module, attribute, the extra it needs, its help in one line).
-_COMMANDS: Final[dict[str, tuple[str, str, str, str]]] = {
-    "detect": ("lanestream_client.commands", "detect", "service,cpu", "Find the lanes of single images."),
-    "evaluate": ("lanestream_exporter.network_commands", "evaluate", "export,service,cpu", "Measure a model file."),
-    "export": ("lanestream_exporter.network_commands", "export", "export,service,cpu", "Write a checkpoint as ONNX."),
-    "scene": ("lanestream_exporter.scene_commands", "scene", "video", "Render a clip with its labels."),
-    "stream": ("lanestream_client.commands", "stream", "video", "Track the lanes of a video or a camera."),
-    "train": ("lanestream_exporter.network_commands", "train", "train,service,cpu", "Train a network."),
+if TYPE_CHECKING:
+    from lanestream.inference.providers import Provider
+    from lanestream.local import LocalEngine
+
+_FAILED: Final = 1
+_INTERRUPTED: Final = 130
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A command of another package: where it is, the extra that its imports need, its line in the help."""
+
+    module: str
+    name: str
+    extra: str
+    help: str
+
+
+_MOUNTS: Final[Mapping[str, Mount]] = {
+    "detect": Mount("lanestream_client.commands", "detect", "video", "Find lanes in images."),
+    "stream": Mount("lanestream_client.commands", "stream", "video", "Follow the lanes of one camera."),
+    "scene": Mount("lanestream_exporter.commands", "scene", "video", "Render a clip of a road, with exact labels."),
+    "train": Mount("lanestream_exporter.network_commands", "train", "train", "Train a network."),
+    "evaluate": Mount("lanestream_exporter.network_commands", "evaluate", "train", "Measure a model's accuracy."),
+    "export": Mount("lanestream_exporter.network_commands", "export", "export", "Turn a checkpoint into a model file."),
 }
 
 
-class LazyGroup(click.Group):
-    """A group whose help needs none of its commands: an extra that is missing hides nothing."""
+class MountingGroup(click.Group):
+    """A group that imports a mounted command only when it is called, so that help needs no extra."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """All commands, whether or not their packages are installed."""
-        return sorted([*super().list_commands(ctx), *_COMMANDS])
+        """All names, own and mounted."""
+        return sorted({*super().list_commands(ctx), *_MOUNTS})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Imports the command. Raises MissingExtraError where its packages are not installed."""
-        if cmd_name not in _COMMANDS:
+        """The command of that name. Raises MissingExtraError where its packages are not installed."""
+        mount = _MOUNTS.get(cmd_name)
+        if mount is None:
             return super().get_command(ctx, cmd_name)
-        module, attribute, extra, _ = _COMMANDS[cmd_name]
-        with needs_extra(extra):
-            command = getattr(importlib.import_module(module), attribute)
-        assert isinstance(command, click.Command)  # noqa: S101 - the table above names commands only
+        with needs_extra(mount.extra):
+            command: click.Command = getattr(import_module(mount.module), mount.name)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Writes the commands with their one line of help."""
-        known = {name: entry[3] for name, entry in _COMMANDS.items()}
-        for name in super().list_commands(ctx):
-            command = super().get_command(ctx, name)
-            known[name] = command.get_short_help_str(80) if command is not None else ""
+        """Lists the commands, the mounted ones by what is known here."""
+        lines = []
+        for name in self.list_commands(ctx):
+            own = None if name in _MOUNTS else super().get_command(ctx, name)
+            lines.append((name, own.get_short_help_str(90) if own else _MOUNTS[name].help))
         with formatter.section("Commands"):
-            formatter.write_dl(sorted(known.items()))
+            formatter.write_dl(lines)
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="lanestream")
+@click.group(cls=MountingGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, message="lanestream %(version)s")
 @click.pass_context
 def cli(context: click.Context) -> None:
     """Camera frames in, tracked lane lines out."""
@@ -60,53 +78,50 @@ def cli(context: click.Context) -> None:
 
 
 @cli.command()
-@click.option("--host", help="Address to listen on. [default: 127.0.0.1]")
-@click.option("--port", type=int, help="Port to listen on; 0 takes a free one. [default: 8000]")
-@click.option("--model", type=click.Path(path_type=Path), help="ONNX file to serve. [default: the shipped one]")
-@click.option("--provider", type=click.Choice(["auto", "cpu", "cuda"]), help="Where it runs. [default: auto]")
-@click.option("--max-sessions", type=int, help="Streams at a time at most. [default: 64]")
+@click.option("--host", help="Address to listen on  [default: 127.0.0.1]")
+@click.option("--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]")
+@click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
+@click.option("--provider", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network runs  [default: auto]")
+@click.option("--threads", type=click.IntRange(1), help="Threads for frames  [default: one a processor]")
 def serve(**given: Any) -> None:
-    """Serve lanes over HTTP and WebSocket; every option is also a variable LANESTREAM_<NAME>."""
+    """Serve lanes over HTTP and WebSockets. Everything can also be set by LANESTREAM_<NAME>."""
     with needs_extra("service,cpu"):
+        # The image module comes first, because OpenCV reads its limit once.
         from lanestream.api.server import serve as run
         from lanestream.engine import load_engine
         from lanestream.settings import load_settings
+        from lanestream_client.overlays import draw_lanes
     settings = load_settings(**given)
-    run(settings, lambda: load_engine(settings.model, settings.provider), _drawing())
-
-
-def _drawing() -> Any:
-    """What draws lanes on pictures, where the client's overlays are installed; they come with this distribution."""
-    try:
-        return importlib.import_module("lanestream_client.overlays").draw_lanes
-    except ImportError:
-        return None
-
-
-def _load_local(model: Path | None, provider: Literal["auto", "cpu", "cuda"] | None) -> Any:
-    """An engine in this process, for commands that were given no URL."""
-    with needs_extra("service,cpu"):
-        from lanestream.local import LocalEngine
-    return LocalEngine.load(model, provider or "auto")
+    run(settings, lambda: load_engine(settings.model, settings.provider), draw_lanes)
 
 
 def main() -> None:
-    """Runs the command line; an error is one line on stderr and the exit code 1."""
+    """Runs the command line. Errors that are raised on purpose are told in one line."""
+    # What OpenCV would warn of on the side is said by the errors; it reads this once, when it is first imported.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     try:
-        sys.exit(cli(standalone_mode=False))
+        code = cli.main(standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output has had enough; the interpreter must not try to flush the rest.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = _FAILED
     except LanestreamError as error:
-        _fail(f"error: {error}", 1)
+        click.echo(f"error: {error}", err=True)
+        code = _FAILED
     except click.ClickException as error:
         error.show()
-        sys.exit(error.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        _fail("interrupted", 130)
-    except BrokenPipeError:
-        # Whoever read our output has gone; what is left in the buffer must not be flushed into nothing at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        code = error.exit_code
+    except click.Abort:
+        code = _INTERRUPTED
+    sys.exit(code if isinstance(code, int) else 0)
 
 
-def _fail(line: str, code: int) -> None:
-    click.echo(line, err=True)
-    sys.exit(code)
+def _load_local(model: Path | None, provider: Provider) -> LocalEngine:
+    with needs_extra("service,cpu"):
+        from lanestream.local import LocalEngine
+    return LocalEngine.load(model, provider)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,6 +6,7 @@ makes network inputs from an image, `finish` makes detections from the network's
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.geometry import RoadView
-from lanestream.lanes import Candidate, Detection, Image
+from lanestream.lanes import Candidate, Curve, Detection, Image
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,11 @@ class Prepared:
 class LaneDetector(Protocol):
     """The two halves of a detector. Both are pure and may run in any thread."""
 
-    def prepare(self, image: Image, horizon: float | None = None) -> Prepared:
-        """Network inputs for a BGR image; `horizon` is its row, give or take a nod of the camera, where it is known."""
+    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
+        """Network inputs for a BGR image; `horizon` is its row, give or take a nod of the camera, where it is known.
+
+        `expected` are the boundaries of the frame before, in image pixels.
+        """
         ...
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:

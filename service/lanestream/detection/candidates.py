@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,20 +65,24 @@ class CandidateSearch:
     most_width: float = 0.4
     separation: float = 0.05
 
-    def propose(self, image: Image, horizon: float | None = None) -> Proposals:
-        """The candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where that is known."""
+    def propose(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Proposals:
+        """The candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where that is known.
+
+        `expected` are boundaries that the last frames had. They are candidates before all others: what is still there
+        need not be found anew.
+        """
         height, width = image.shape[:2]
         scaling = Scaling(WORKING_WIDTH / width)
         grey = resized(paint_grey(image), scaling)
         point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon))
         view = RoadView(grey.shape[1], grey.shape[0], point.y)
         image_view = RoadView(width, height, scaling.to_image(point.y))
-        candidates: list[Candidate] = []
-        for line in self._suppress(self._ranked(grey, view, point, lines), view):
-            candidate = _candidate(line, scaling.curve_to_image(_curve(line, view, point)), image_view)
-            if candidate is not None and len(candidates) < self.limit:
-                candidates.append(candidate)
-        return Proposals(tuple(candidates), image_view, point.weight)
+        known = [_line(scaling.curve_to_working(curve), view) for curve in expected]
+        new = self._suppress(self._ranked(grey, view, point, lines), known, view)
+        curves = [(line, scaling.curve_to_image(_curve(line, view, point))) for line in new]
+        found = [_candidate(line, curve, image_view) for line, curve in [*zip(known, expected, strict=True), *curves]]
+        candidates = [candidate for candidate in found if candidate is not None]
+        return Proposals(tuple(candidates[: self.limit]), image_view, point.weight)
 
     def _road(self, grey: Image, horizon: float | None) -> tuple[Perspective, HoughLines]:
         """The perspective of the working image and the Hough lines of its road."""
@@ -124,15 +129,18 @@ class CandidateSearch:
         strength = 0.6 * lines.votes * _aimed(near, far, view, point)
         return [_Line(float(n), float(f), float(s)) for n, f, s in zip(near, far, strength, strict=True)]
 
-    def _suppress(self, ranked: list[_Line], view: RoadView) -> list[_Line]:
-        """The strongest lines of which no two are nearer than `separation` at both rows, across the flatter ones."""
+    def _suppress(self, ranked: list[_Line], known: list[_Line], view: RoadView) -> list[_Line]:
+        """The strongest lines of which no two are nearer than `separation` at both rows, nor near a known one.
+
+        Flat lines lie closer to each other than their columns tell, so the distance is measured across them.
+        """
         kept: list[_Line] = []
         for line in ranked:
             slope = (line.near - line.far) / ((_NEAR - _FAR) * view.depth)
             least = self.separation * view.depth * math.hypot(1.0, slope)
             if not any(
                 abs(line.near - other.near) < _NEAR * least and abs(line.far - other.far) < _FAR * least
-                for other in kept
+                for other in (*known, *kept)
             ):
                 kept.append(line)
         return kept
@@ -159,6 +167,12 @@ def _aimed(
 def _normalised(lines: list[_Line]) -> list[_Line]:
     strongest = max((line.strength for line in lines), default=1.0)
     return [replace(line, strength=line.strength / strongest) for line in lines]
+
+
+def _line(curve: Curve, view: RoadView) -> _Line:
+    """A curve of the working image by its columns at the near and the far row."""
+    near, far = curve.x(np.array([view.row_at(_NEAR), view.row_at(_FAR)]))
+    return _Line(float(near), float(far), 1.0)
 
 
 def _curve(line: _Line, view: RoadView, point: Perspective) -> Curve:

@@ -13,7 +13,7 @@ from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
 from lanestream.detection.refinement import Refinement
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_rows
-from lanestream.lanes import Detection, Image
+from lanestream.lanes import Curve, Detection, Image
 
 TRUE_LANE = 1
 
@@ -32,9 +32,9 @@ class CandidateDetector:
     refinement: Refinement = Refinement()
     separation: float = 0.8
 
-    def prepare(self, image: Image, horizon: float | None = None) -> Prepared:
+    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
         """Patches of the candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where known."""
-        proposals = self.search.propose(image, horizon)
+        proposals = self.search.propose(image, horizon, expected)
         patches = self.cutter.cut(image, proposals.candidates, proposals.view)
         return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)
 

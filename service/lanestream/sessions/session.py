@@ -32,7 +32,8 @@ class Session:
         """The first half of a frame: network inputs from a BGR image (H, W, 3) uint8. Leaves the session as it is."""
         height = image.shape[0]
         share = self._configured if self._configured is not None else self._estimate
-        return self._detector.prepare(image, None if share is None else share * height)
+        expected = self._tracker.curves if self._size == (image.shape[1], height) else ()
+        return self._detector.prepare(image, None if share is None else share * height, expected)
 
     def conclude(self, prepared: Prepared, outputs: NDArray[np.float32], timestamp: float) -> FrameResult:
         """The second half: detections from the network's outputs, then one step of the tracker.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lanestream.geometry import RoadView, visible_rows
-from lanestream.lanes import Detection, EgoLane, FloatArray, FrameResult, LaneBoundary, LaneChange
+from lanestream.lanes import Curve, Detection, EgoLane, FloatArray, FrameResult, LaneBoundary, LaneChange
 from lanestream.tracking.association import associate
 from lanestream.tracking.filter import Rows, boundary_filter, predict
 from lanestream.tracking.positions import LaneWidth, Sides, positions
@@ -53,6 +53,12 @@ class LaneTracker:
         self._clock = 0.0
         self._last_timestamp: float | None = None
         self._frames = 0
+
+    @property
+    def curves(self) -> tuple[Curve, ...]:
+        """Where the boundaries were in the last frame."""
+        rows = self._rows
+        return () if rows is None else tuple(rows.curve(t.columns) for t in self._tracks if t.confirmed)
 
     def update(self, detections: Sequence[Detection], timestamp: float, view: RoadView) -> FrameResult:
         """One step: `detections` of the frame captured at `timestamp` (seconds), seen in `view`.
