@@ -15,6 +15,7 @@ from lanestream_exporter.evaluate import Evaluation
 from lanestream_exporter.export import ExportReport, ExportSettings, export_classifier
 from lanestream_exporter.patchstore import PatchStore, read_stores
 from lanestream_exporter.rendering import real_store, rendered_stores
+from lanestream_exporter.score import score as measured
 from lanestream_exporter.train import ClassifierTraining, TrainData, TrainSettings
 from lanestream_exporter.train import Progress as TrainProgress
 
@@ -101,6 +102,14 @@ def evaluate(model: Path, split: str, json_path: Path | None, data: Path | None)
     if json_path is not None:
         json_path.parent.mkdir(parents=True, exist_ok=True)
         json_path.write_text(text + "\n")
+
+
+@click.command()
+@click.argument("results", type=click.Path(path_type=Path))
+@click.argument("labels", type=click.Path(path_type=Path))
+def score(results: Path, labels: Path) -> None:
+    """Measure RESULTS, a file that `stream --jsonl` wrote, against the LABELS of the clip."""
+    click.echo(json.dumps(measured(results, labels), indent=2))
 
 
 def _stores(folder: Path, root: Path, files: int) -> TrainData:
