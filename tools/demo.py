@@ -1,7 +1,7 @@
 """`make demo`: a clip through a service of its own, as a user would send it; results under out/.
 
-Without a video it renders one. The service runs on a free port, is waited for until it is ready, and is stopped whatever
-happens.
+Without a video it renders one. The service runs on a free port, is waited for until it is ready, and is stopped
+whatever happens.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ def main(video: str | None) -> int:
     if video is None:
         video = str(OUT / "scene.mp4")
         print(f"rendering {video}", flush=True)
-        subprocess.run([LANESTREAM, "scene", video, "--lane-change"], check=True)
+        code = subprocess.run([LANESTREAM, "scene", video, "--lane-change"], check=False).returncode
+        if code:
+            return code
     name = Path(video).stem
     results, annotated = OUT / f"{name}.lanes.jsonl", OUT / f"{name}.annotated.mp4"
     with service() as url:
@@ -50,8 +52,16 @@ def service() -> Iterator[str]:
             wait_until_ready(process, url)
             yield url
         finally:
-            process.send_signal(signal.SIGTERM)
-            process.wait(timeout=30)
+            stop(process)
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    """Asks the service to end, and ends it where it does not."""
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(timeout=30)
+    except subprocess.TimeoutExpired:
+        process.kill()
 
 
 def wait_until_ready(process: subprocess.Popen[bytes], url: str) -> None:
@@ -74,4 +84,7 @@ def free_port() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1] if len(sys.argv) > 1 else None))
+    try:
+        sys.exit(main(sys.argv[1] if len(sys.argv) > 1 else None))
+    except KeyboardInterrupt:
+        sys.exit(130)

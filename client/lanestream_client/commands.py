@@ -216,9 +216,11 @@ def _detected(service: LaneService, path: Path, horizon: float | None) -> LanesM
     """The lanes of an image; None, with a line about why, where that image has none to give."""
     try:
         return service.detect(image_bytes(path), horizon=horizon)
-    except (ImageError, SourceError) as error:
+    except ImageError as error:
         click.echo(f"error: {path}: {error}", err=True)
-        return None
+    except SourceError as error:
+        click.echo(f"error: {error}", err=True)
+    return None
 
 
 def _in_words(lanes: LanesMessage) -> str:

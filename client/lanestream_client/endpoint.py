@@ -22,9 +22,14 @@ class Endpoint:
     @classmethod
     def parse(cls, url: str) -> Endpoint:
         """The place at `url`, http, https, ws or wss, with or without a path before `/v1`. Raises SettingsError."""
-        parts = urlsplit(url if "://" in url else f"http://{url}")
-        if parts.scheme not in _HTTP_SCHEMES or not parts.hostname:
-            raise SettingsError(f"{url!r} is no address of a service", "http://127.0.0.1:8000 would be one")
+        refused = SettingsError(f"{url!r} is no address of a service", "http://127.0.0.1:8000 would be one")
+        try:
+            parts = urlsplit(url if "://" in url else f"http://{url}")
+            known = parts.scheme in _HTTP_SCHEMES and bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            raise refused from None
+        if not known:
+            raise refused
         path = parts.path.removesuffix("/v1/stream").rstrip("/")
         place = f"{parts.netloc}{path}"
         scheme = _HTTP_SCHEMES[parts.scheme]

@@ -33,13 +33,17 @@ class Mount:
     help: str
 
 
+_CLIENT: Final = "lanestream_client.commands"
+_SCENES: Final = "lanestream_exporter.commands"
+_NETWORKS: Final = "lanestream_exporter.network_commands"
 _MOUNTS: Final[Mapping[str, Mount]] = {
-    "detect": Mount("lanestream_client.commands", "detect", "video", "Find lanes in images."),
-    "stream": Mount("lanestream_client.commands", "stream", "video", "Follow the lanes of one camera."),
-    "scene": Mount("lanestream_exporter.commands", "scene", "video", "Render a clip of a road, with exact labels."),
-    "train": Mount("lanestream_exporter.network_commands", "train", "train", "Train a network."),
-    "evaluate": Mount("lanestream_exporter.network_commands", "evaluate", "train", "Measure a model's accuracy."),
-    "export": Mount("lanestream_exporter.network_commands", "export", "export", "Turn a checkpoint into a model file."),
+    "detect": Mount(_CLIENT, "detect", "video", "Find lanes in images."),
+    "stream": Mount(_CLIENT, "stream", "video", "Follow the lanes of one camera."),
+    "scene": Mount(_SCENES, "scene", "video", "Render a clip of a road, with exact labels."),
+    "train": Mount(_NETWORKS, "train", "train,service,cpu", "Train a network."),
+    "export": Mount(_NETWORKS, "export", "export,service,cpu", "Turn a checkpoint into a model file."),
+    "evaluate": Mount(_NETWORKS, "evaluate", "export,service,cpu", "Measure a model's accuracy."),
+    "score": Mount(_NETWORKS, "score", "export,service,cpu", "Measure a stream's results against labels."),
 }
 
 
@@ -82,7 +86,7 @@ def cli(context: click.Context) -> None:
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]")
 @click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
 @click.option("--provider", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network runs  [default: auto]")
-@click.option("--threads", type=click.IntRange(1), help="Threads for frames  [default: one a processor]")
+@click.option("--max-sessions", type=click.IntRange(1), help="Streams at a time at most  [default: 64]")
 def serve(**given: Any) -> None:
     """Serve lanes over HTTP and WebSockets. Everything can also be set by LANESTREAM_<NAME>."""
     with needs_extra("service,cpu"):

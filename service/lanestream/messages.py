@@ -72,9 +72,10 @@ def _lane(lane: LaneBoundary) -> LaneModel:
 
 
 def _points(lane: LaneBoundary) -> list[Point]:
-    rows = np.linspace(lane.bottom, lane.top, _POINTS)
+    # Rounded rows first, so that the points are on the curve.
+    rows = np.linspace(lane.bottom, lane.top, _POINTS).round(2)
     columns = lane.curve.x(rows)
-    return [(round(float(x), 2), round(float(y), 2)) for x, y in zip(columns, rows, strict=True)]
+    return [(round(float(x), 2), float(y)) for x, y in zip(columns, rows, strict=True)]
 
 
 def _significant(matrix: FloatArray) -> list[list[float]]:

@@ -55,7 +55,7 @@ def load_settings(**given: object) -> Settings:
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         name = str(problem["loc"][0])
-        label = f"--{name}" if name in chosen else _PREFIX + name.upper()
+        label = f"--{name.replace('_', '-')}" if name in chosen else _PREFIX + name.upper()
         raise SettingsError(f"{label} = {problem['input']!r}: {_sentence(problem['msg'])}") from None
 
 

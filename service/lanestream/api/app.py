@@ -75,4 +75,6 @@ async def _tell_http(request: Request, error: Exception) -> JSONResponse:
 
 
 def _answer(status: int, code: str, message: str, hint: str) -> JSONResponse:
-    return JSONResponse({"code": code, "message": message, "hint": hint}, status)
+    # What is left of a body that is too large will not be read.
+    headers = {"connection": "close"} if status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE else None
+    return JSONResponse({"code": code, "message": message, "hint": hint}, status, headers)

@@ -51,7 +51,7 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise SettingsError(f"port {port} on {host} is in use", "choose another with --port") from None
-        reason = (error.strerror or str(error)).lower()
+        reason = (error.strerror or str(error)).partition(" (")[0].lower()
         raise SettingsError(f"can't listen on {host}, port {port}: {reason}", "see --host and --port") from None
 
 

@@ -68,9 +68,7 @@ class StreamHandler:
                 _log.exception("stream failed")
             await self._close_with(error)
         finally:
-            if self._opened is not None:
-                self._service.sessions.close(self._opened)
-                _log.info("stream %s closed: %s", self._opened.id, self._rules.summary(time.monotonic()))
+            self._release()
 
     async def _converse(self) -> None:
         """Reads and answers at once; the end of either is the end of both."""
@@ -132,6 +130,8 @@ class StreamHandler:
                 continue
             self._news.clear()
             await self._news.wait()
+        # Whoever has seen the summary finds the place free.
+        self._release()
         await self._send(self._rules.summary(time.monotonic()))
         await self._socket.close()
 
@@ -147,6 +147,17 @@ class StreamHandler:
             return error_message(error, seq=frame.seq)
         self._rules.settle(answered=True)
         return lanes_message(processed, seq=frame.seq, timestamp=frame.timestamp, dropped=self._rules.dropped)
+
+    def _release(self) -> None:
+        if self._opened is None:
+            return
+        self._service.sessions.close(self._opened)
+        count = self._rules.summary(time.monotonic())
+        _log.info(
+            "stream %s closed after %.1f s: %d frames, %d answered, %d failed, %d dropped",
+            *(self._opened.id, count.duration_s, count.frames, count.answered, count.failed, count.dropped),
+        )
+        self._opened = None
 
     async def _send(self, message: Message) -> None:
         await self._socket.send_text(message.model_dump_json())

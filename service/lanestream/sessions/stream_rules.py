@@ -90,9 +90,8 @@ class StreamRules:
                 f"{unanswered} frames are unanswered and one more came",
                 f"mode `all` grants {self._most_unanswered} of them; wait for answers, or use mode `latest`",
             )
-        if self.mode == "latest" and self._waiting:
-            self._waiting.clear()
-            self._dropped += 1
+        if self.mode == "latest":
+            self._drop_waiting()
         self._waiting.append(self._numbered(data, now))
         self._received += 1
 
@@ -125,6 +124,13 @@ class StreamRules:
             dropped=self._dropped,
             duration_s=round(now - self._opened_at, 3),
         )
+
+    def _drop_waiting(self) -> None:
+        """Makes place for a newer frame. A frame whose turn has come stays, whether or not it was taken already."""
+        turn = 0 if self._busy else 1
+        while len(self._waiting) > turn:
+            self._waiting.pop()
+            self._dropped += 1
 
     def _numbered(self, data: bytes, now: float) -> IncomingFrame:
         announced = self._announced or FrameMessage()

@@ -1,0 +1,82 @@
+"""Stand-ins for what is slow or can't be steered: a detector that knows the road, networks that wait to be told."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.detection import Prepared
+from lanestream.engine import Engine
+from lanestream.geometry import RoadView, visible_rows
+from lanestream.lanes import Curve, Detection, Image
+
+WAIT_S = 10.0  # far more than anything takes; a test that hangs fails instead
+
+
+class FakeDetector:
+    """Sees the two boundaries of a straight ego lane in every frame; fails at a frame that is white all over."""
+
+    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
+        height, width = image.shape[:2]
+        view = RoadView(width, height, 0.4 * height if horizon is None else horizon)
+        return Prepared(image, np.zeros((2, 8, 8, 3), np.uint8), view, (), 1.0)
+
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:
+        if prepared.image.min() == 255:
+            raise RuntimeError("a detector's own mistake")
+        found = []
+        for b in (-1.15, 1.15):
+            curve = Curve(prepared.view.horizon, ((prepared.view.width - 1) / 2, b, 0.0))
+            rows = visible_rows(curve, prepared.view, 0.1)
+            assert rows is not None
+            found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9))
+        return found
+
+
+class FakeNetwork:
+    """Answers at once."""
+
+    name = "fake 1"
+    provider = "cpu"
+    metadata: dict[str, Any] = {"kind": "fake"}  # noqa: RUF012
+
+    def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return np.full((len(inputs), 2), 0.5, np.float32)
+
+
+class GatedNetwork(FakeNetwork):
+    """Holds every frame until it is let through."""
+
+    def __init__(self) -> None:
+        self._arrived = threading.Semaphore(0)
+        self._gate = threading.Semaphore(0)
+
+    def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        self._arrived.release()
+        assert self._gate.acquire(timeout=WAIT_S)
+        return super().run(inputs)
+
+    def wait_for_a_frame(self) -> None:
+        """Returns when a frame is being held."""
+        assert self._arrived.acquire(timeout=WAIT_S)
+
+    def let_through(self, frames: int = 1) -> None:
+        """Lets frames pass, held ones or later ones."""
+        self._gate.release(frames)
+
+
+def engine(network: FakeNetwork | None = None) -> Engine:
+    """An engine of fakes."""
+    return Engine(FakeDetector(), network or FakeNetwork())
+
+
+def image_file(kind: str = ".jpg", width: int = 320, height: int = 180, shade: int | None = None) -> bytes:
+    """An image file of a grey ramp, or of one `shade`."""
+    ramp = np.tile(np.linspace(30, 220, width).astype(np.uint8)[None, :, None], (height, 1, 3))
+    image = ramp if shade is None else np.full_like(ramp, shade)
+    return cv2.imencode(kind, image)[1].tobytes()

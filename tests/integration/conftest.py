@@ -1,0 +1,63 @@
+"""Real servers on real sockets, in this process, each in a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+import fakes
+import pytest
+import uvicorn
+
+from lanestream.api import create_app
+from lanestream.api.server import listen, server_config
+from lanestream.engine import Engine, load_engine
+from lanestream.settings import Settings
+from lanestream_client.overlays import draw_lanes
+
+Serve = Callable[..., str]
+
+
+@contextmanager
+def serving(engine: Engine | None, settings: Settings) -> Iterator[str]:
+    """The URL of a server around `engine`."""
+    app = create_app(engine, settings, draw_lanes)
+    listener = listen("127.0.0.1", 0)
+    server = uvicorn.Server(server_config(app, settings))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    thread.start()
+    try:
+        yield url
+    finally:
+        server.should_exit = True
+        thread.join(fakes.WAIT_S)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """Starts a server with an engine and settings of the test's choice, and gives its URL."""
+    with ExitStack() as stack:
+        yield lambda engine=None, **settings: stack.enter_context(serving(engine, Settings(**settings)))
+
+
+@pytest.fixture(scope="session")
+def url() -> Iterator[str]:
+    """A server with an engine of fakes that answer at once."""
+    with serving(fakes.engine(), Settings(max_bytes=200_000)) as place:
+        yield place
+
+
+@pytest.fixture(scope="session")
+def real_engine() -> Engine:
+    """The shipped network on the CPU."""
+    return load_engine(None, "cpu")
+
+
+@pytest.fixture(scope="session")
+def real_url(real_engine: Engine) -> Iterator[str]:
+    """A server with the shipped network."""
+    with serving(real_engine, Settings()) as place:
+        yield place

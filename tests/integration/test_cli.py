@@ -1,0 +1,276 @@
+"""The command line as a user meets it: what it says, where it says it, and the exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import av
+import cv2
+import fakes
+import httpx
+import numpy as np
+import pytest
+
+from lanestream import cli
+from lanestream.api.server import listen
+from lanestream.engine import Engine
+from lanestream.local import LocalEngine
+from lanestream_client.sinks import video_sink
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Runs `lanestream` in this process and an empty folder, with an engine of fakes: (exit code, output, errors)."""
+
+    def called(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["lanestream", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+        output, errors = capsys.readouterr()
+        assert "Traceback" not in output + errors
+        return int(caught.value.code or 0), output, errors
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider: LocalEngine(fakes.engine()))
+    return called
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    """A video of ten frames, 320 x 180."""
+    with video_sink(tmp_path / "clip.mp4", 25.0) as sink:
+        assert sink is not None
+        for number in range(10):
+            sink.write(np.full((180, 320, 3), 20 * number, np.uint8), number / 25.0)
+    return tmp_path / "clip.mp4"
+
+
+def lines_of(path: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_help_needs_no_extra() -> None:
+    blocked = (
+        "import sys; sys.modules.update(dict.fromkeys(['cv2', 'av', 'numpy', 'onnxruntime', 'fastapi', 'torch']));"
+    )
+    script = f"{blocked} from lanestream.cli import main; main()"
+    helped = subprocess.run(
+        [sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True, timeout=30
+    )
+    for name in ("serve", "detect", "stream", "scene", "train", "export", "evaluate", "score"):
+        assert f"  {name} " in helped.stdout
+    for arguments in (["detect", "x.jpg"], ["scene", "x.mp4"], ["serve"]):
+        refused = subprocess.run(
+            [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False, timeout=30
+        )
+        assert refused.returncode == 1
+        assert refused.stderr.startswith("error: this needs the package")
+        assert "pip install 'lanestream[" in refused.stderr
+
+
+def test_detect_tells_every_image_and_goes_on_after_a_bad_one(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    (folder / "10.jpg").write_bytes(fakes.image_file())
+    (folder / "2.png").write_bytes(fakes.image_file(".png"))
+    (folder / "3.jpg").write_bytes(b"no image")
+    code, output, errors = run("detect", folder, "--annotate", "drawn", "--jsonl", "lanes.jsonl")
+    assert code == 1
+    assert "3 frames: 2 answered, 0 dropped, 1 failed" in output
+    assert "model fake 1 on cpu" in output
+    assert errors == f"error: {folder}/3.jpg: not an image: it looks like text (JPEG, PNG or WebP are accepted)\n"
+    assert [line["file"] for line in lines_of(tmp_path / "lanes.jsonl")] == [f"{folder}/2.png", f"{folder}/10.jpg"]
+    assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["10.jpg.lanes.jpg", "2.png.lanes.jpg"]
+    code, output, _ = run("detect", folder / "2.png")
+    assert code == 0
+    assert re.match(rf"{folder}/2.png: 2 boundaries, ego left and right, \d+\.\d ms\n", output)
+
+
+def test_detect_writes_json_to_the_output_and_nothing_else(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(fakes.image_file())
+    code, output, errors = run("detect", "a.jpg", "--jsonl", "-")
+    assert code == 0
+    assert json.loads(output)["file"] == "a.jpg"
+    assert "1 answered" in errors
+
+
+def test_stream_in_process(run: Run, clip: Path, tmp_path: Path) -> None:
+    code, output, errors = run("stream", clip, "--jsonl", "lanes.jsonl", "--video", "drawn.mp4")
+    assert (code, errors) == (0, "")
+    assert "10 frames: 10 answered, 0 dropped, 0 failed" in output
+    assert "both ego boundaries in 100.0 %" in output
+    assert [line["seq"] for line in lines_of(tmp_path / "lanes.jsonl")] == list(range(10))
+    with av.open(str(tmp_path / "drawn.mp4")) as video:
+        assert [round(25 * frame.time) for frame in video.decode(video=0)] == list(range(10))
+
+
+@pytest.mark.parametrize("mode", ["all", "latest"])
+def test_stream_through_a_service(run: Run, clip: Path, url: str, mode: str) -> None:
+    code, output, _ = run("stream", clip, "--url", url, "--mode", mode)
+    assert code == 0
+    assert "10 frames: 10 answered" in output
+    assert "model fake 1 on cpu" in output
+
+
+def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number in (1, 2, 10):
+        (folder / f"{number}.jpg").write_bytes(fakes.image_file())
+    (folder / "3.jpg").write_bytes(fakes.image_file()[:500])
+    code, output, errors = run("stream", folder, "--fps", "20", "--jsonl", "lanes.jsonl", "--video", "drawn.mp4")
+    assert code == 0
+    assert "4 frames: 3 answered, 0 dropped, 1 failed" in output
+    assert errors == "frame 2: the JPEG image is cut short: its end is missing\n"
+    lines = lines_of(tmp_path / "lanes.jsonl")
+    assert [(line["file"], line["type"]) for line in lines] == [
+        ("1.jpg", "lanes"),
+        ("2.jpg", "lanes"),
+        ("3.jpg", "error"),
+        ("10.jpg", "lanes"),
+    ]
+    assert [line.get("timestamp") for line in lines] == [0.0, 0.05, None, 0.15]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["stream", "none.mp4"], 1, "error: no such file or folder: none.mp4 ("),
+        (["stream", "text.mp4"], 1, "error: can't open text.mp4: invalid data found when processing input ("),
+        (["stream", "empty"], 1, "error: no image in the folder empty ("),
+        (
+            ["stream", "rtsp://user:secret@127.0.0.1:9/x"],
+            1,
+            "error: can't open rtsp://127.0.0.1:9/x: connection refused (",
+        ),
+        (
+            ["stream", "clip.mp4", "--url", "http://127.0.0.1:9"],
+            1,
+            "error: can't reach the service at http://127.0.0.1:9: ",
+        ),
+        (["stream", "clip.mp4", "--url", "gopher://x"], 1, "error: 'gopher://x' is no address of a service ("),
+        (["stream", "clip.mp4", "--url", "x", "--model", "m.onnx"], 2, "Usage:"),
+        (["stream", "clip.mp4", "--video", "/dev/null/x.mp4"], 1, "error: can't write /dev/null/x.mp4: "),
+        (["stream", "clip.mp4", "--jsonl", "/dev/null/x.jsonl"], 1, "error: can't write /dev/null/x.jsonl: "),
+        (["stream", "clip.mp4", "--mode", "some"], 2, "Usage:"),
+        (["stream"], 2, "Usage:"),
+        (["detect", "none.jpg"], 1, "error: can't read none.jpg: no such file or directory"),
+        (["detect", "empty"], 1, "error: no image in the folder empty ("),
+        (["detect", "x.jpg", "--horizon", "2"], 2, "Usage:"),
+        (["scene", "/dev/null/x.mp4"], 1, "error: can't write /dev/null/x.mp4: "),
+        (["scene", "x.mp4", "--size", "641x360"], 2, "Usage:"),
+        (["serve", "--host", "no such host"], 1, "error: can't listen on no such host, port "),
+        (["fly"], 2, "Usage:"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(
+    run: Run, clip: Path, tmp_path: Path, arguments: list[str], code: int, said: str
+) -> None:
+    (tmp_path / "text.mp4").write_text("no video")
+    (tmp_path / "empty").mkdir()
+    found, _, errors = run(*arguments)
+    assert (found, errors[: len(said)]) == (code, said)
+    assert code == 2 or errors.count("\n") == 1
+    assert "secret" not in errors
+
+
+def test_a_busy_port_is_told(run: Run) -> None:
+    with listen("127.0.0.1", 0) as busy:
+        port = busy.getsockname()[1]
+        assert run("serve", "--port", port) == (
+            1,
+            "",
+            f"error: port {port} on 127.0.0.1 is in use (choose another with --port)\n",
+        )
+
+
+def test_a_bad_variable_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LANESTREAM_PORT", "many")
+    code, _, errors = run("serve")
+    assert (code, errors.count("\n")) == (1, 1)
+    assert errors.startswith("error: LANESTREAM_PORT = 'many': input should be a valid integer")
+
+
+@pytest.mark.parametrize("name", ["model.onnx", "none.onnx"])
+def test_a_model_that_is_none_ends_the_service(run: Run, tmp_path: Path, name: str) -> None:
+    (tmp_path / "model.onnx").write_text("no model")
+    code, _, errors = run("serve", "--port", "0", "--model", name)
+    assert code == 1
+    assert errors.splitlines()[-1].startswith("error: ")
+    assert name in errors.splitlines()[-1]
+
+
+@pytest.fixture
+def service() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`lanestream serve` in a process of its own, with its URL."""
+    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        told = next(line for line in process.stderr if "listening on" in line)
+        try:
+            yield process, told.split("listening on ")[1].split(",")[0]
+        finally:
+            process.kill()
+
+
+def test_the_service_lives_before_it_is_ready_and_ends_cleanly(service: tuple[subprocess.Popen[str], str]) -> None:
+    process, url = service
+    statuses = [httpx.get(f"{url}/readyz").status_code]
+    assert httpx.get(f"{url}/healthz").status_code == 200
+    while statuses[-1] != 200:
+        assert process.poll() is None
+        statuses.append(httpx.get(f"{url}/readyz").status_code)
+    assert set(statuses) <= {503, 200}
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=fakes.WAIT_S)
+    assert process.returncode == 0
+    assert "Traceback" not in errors
+
+
+def test_an_interrupt_ends_a_stream_with_its_summary(tmp_path: Path, real_engine: Engine) -> None:
+    video = tmp_path / "long.mp4"
+    with video_sink(video, 25.0) as sink:
+        assert sink is not None
+        picture = cv2.imdecode(np.frombuffer(fakes.image_file(), np.uint8), cv2.IMREAD_COLOR)
+        for number in range(500):
+            sink.write(picture, number / 25.0)
+    command = [
+        sys.executable,
+        "-m",
+        "lanestream.cli",
+        "stream",
+        video,
+        "--jsonl",
+        "/dev/stdout",
+        "--video",
+        "drawn.mp4",
+    ]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith('{"type": "lanes"')
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=fakes.WAIT_S)
+    assert process.returncode == 130
+    assert "frames/s" in output
+    assert "Traceback" not in errors
+    with av.open(str(tmp_path / "drawn.mp4")) as drawn:
+        assert sum(1 for _ in drawn.decode(video=0)) > 0
+
+
+def test_a_reader_that_has_had_enough_is_no_error(clip: Path) -> None:
+    script = f'"{sys.executable}" -m lanestream.cli stream "{clip}" --jsonl - | head -n 1 | cut -c 1-16'
+    done = subprocess.run(["/bin/sh", "-c", script], capture_output=True, text=True, check=True, timeout=30)
+    assert done.stdout == '{"type": "lanes"\n'
+    assert "Error" not in done.stderr

@@ -1,0 +1,151 @@
+"""Single requests over real sockets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import fakes
+import httpx
+import numpy as np
+import pytest
+
+from lanestream.protocol import LanesMessage, parse_server_message
+
+Serve = Callable[..., str]
+
+
+def detect(url: str, content: bytes | None, **more: object) -> httpx.Response:
+    return httpx.post(f"{url}/v1/detect", content=content, **more)
+
+
+def problem(response: httpx.Response) -> tuple[int, str]:
+    told = response.json()
+    assert set(told) == {"code", "message", "hint"}
+    assert "\n" not in told["message"]
+    return response.status_code, told["code"]
+
+
+@pytest.mark.parametrize("kind", [".jpg", ".png", ".webp"])
+def test_an_image_gives_its_lanes(url: str, kind: str) -> None:
+    response = detect(url, fakes.image_file(kind))
+    lanes = parse_server_message(response.text)
+    assert isinstance(lanes, LanesMessage)
+    assert (lanes.seq, lanes.width, lanes.height, lanes.dropped) == (0, 320, 180, 0)
+    assert [lane.position for lane in lanes.lanes] == [-1, 1]
+    stages = lanes.timing_ms
+    assert stages.total == pytest.approx(
+        stages.decode + stages.propose + stages.queue + stages.infer + stages.track, abs=0.01
+    )
+
+
+def test_a_form_with_a_file_is_the_same(url: str) -> None:
+    response = httpx.post(f"{url}/v1/detect", files={"file": ("road.jpg", fakes.image_file())})
+    assert response.json()["width"] == 320
+
+
+@pytest.mark.parametrize(
+    ("sent", "status"),
+    [
+        ({"files": {"other": ("road.jpg", b"x")}}, 422),
+        ({"data": {"file": "text"}}, 415),
+        ({"content": b"x", "headers": {"content-type": "multipart/form-data"}}, 422),
+        ({"content": b"x", "headers": {"content-type": "multipart/form-data; boundary=b"}}, 422),
+        ({"files": {"file": ("road.jpg", b"x" * 300_000)}}, 413),
+    ],
+)
+def test_a_form_without_a_good_file_is_refused(url: str, sent: dict[str, object], status: int) -> None:
+    assert problem(httpx.post(f"{url}/v1/detect", **sent))[0] == status
+
+
+@pytest.mark.parametrize(
+    ("accept", "kind"), [("image/png", b"\x89PNG"), ("image/*", b"\xff\xd8"), ("image/jpeg", b"\xff\xd8")]
+)
+def test_a_picture_can_be_had(url: str, accept: str, kind: bytes) -> None:
+    response = detect(url, fakes.image_file(), headers={"accept": accept})
+    assert response.content.startswith(kind)
+    picture = cv2.imdecode(np.frombuffer(response.content, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    assert picture.shape == (180, 320, 3)
+    assert picture.std(axis=2).max() > 10, "the lanes are in colour, the image is grey"
+
+
+def test_another_form_can_not(url: str) -> None:
+    assert problem(detect(url, fakes.image_file(), headers={"accept": "text/html"})) == (406, "not_acceptable")
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"", (415, "bad_image")),
+        (b"hello, is this a road?", (415, "bad_image")),
+        (fakes.image_file()[:-100], (415, "bad_image")),
+        (fakes.image_file(".png", 1, 1), (415, "bad_image")),
+        (fakes.image_file(".png", 8000, 1200, 0), (413, "image_too_large")),
+        (bytes(300_000), (413, "image_too_large")),
+    ],
+)
+def test_bad_images_are_told_why(url: str, data: bytes, told: tuple[int, str]) -> None:
+    assert problem(detect(url, data)) == told
+
+
+def test_a_body_of_unknown_length_is_not_read_beyond_the_limit(url: str) -> None:
+    def endless() -> object:
+        while True:
+            yield bytes(50_000)
+
+    with httpx.Client() as client:
+        try:
+            assert problem(client.post(f"{url}/v1/detect", content=endless())) == (413, "image_too_large")
+        except (httpx.WriteError, httpx.ReadError, httpx.RemoteProtocolError):
+            pass  # the service has answered and closed; whether the answer is still read is the kernel's choice
+
+
+@pytest.mark.parametrize("horizon", ["0", "1", "-0.1", "nan", "x"])
+def test_a_horizon_outside_the_image_is_refused(url: str, horizon: str) -> None:
+    assert problem(detect(url, fakes.image_file(), params={"horizon": horizon})) == (422, "bad_message")
+
+
+def test_a_horizon_is_used(url: str) -> None:
+    assert detect(url, fakes.image_file(), params={"horizon": "0.25"}).json()["horizon"] == pytest.approx(45.0)
+
+
+def test_an_error_of_our_own_is_no_traceback(url: str) -> None:
+    response = detect(url, fakes.image_file(shade=255))
+    assert problem(response) == (500, "internal")
+    assert "mistake" not in response.text
+
+
+def test_unknown_paths_and_methods_are_told_alike(url: str) -> None:
+    assert problem(httpx.get(f"{url}/nothing")) == (404, "not_found")
+    refused = httpx.get(f"{url}/v1/detect")
+    assert problem(refused) == (405, "method_not_allowed")
+    assert refused.headers["allow"] == "POST"
+
+
+def test_what_runs_is_told(url: str) -> None:
+    model = {"name": "fake 1", "detector": "candidates", "provider": "cpu", "metadata": {"kind": "fake"}}
+    assert httpx.get(f"{url}/v1/models").json() == {"models": [model]}
+    assert httpx.get(f"{url}/healthz").json() == {"status": "alive"}
+    assert httpx.get(f"{url}/readyz").json() == {"status": "ready", "provider": "cpu"}
+
+
+def test_the_schemas_and_the_documentation_are_there(url: str) -> None:
+    schemas = httpx.get(f"{url}/v1/schema").json()
+    assert "LanesMessage" in schemas["server"]["$defs"]
+    assert "StartMessage" in schemas["client"]["$defs"]
+    content = httpx.get(f"{url}/openapi.json").json()["paths"]["/v1/detect"]["post"]["requestBody"]["content"]
+    assert {"image/jpeg", "multipart/form-data"} <= set(content)
+
+
+def test_single_images_count_as_sessions(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    place = serve(fakes.engine(network), max_sessions=1)
+    with ThreadPoolExecutor(1) as other:
+        first = other.submit(detect, place, fakes.image_file())
+        network.wait_for_a_frame()
+        refused = detect(place, fakes.image_file())
+        network.let_through(1)
+        assert problem(refused) == (503, "busy")
+        assert first.result().status_code == 200

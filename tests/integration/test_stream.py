@@ -1,0 +1,286 @@
+"""Streams over real sockets, message by message."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import fakes
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from lanestream.protocol import parse_server_message
+
+Serve = Callable[..., str]
+README = Path(__file__).parents[2] / "README.md"
+
+
+@contextmanager
+def stream(url: str, **start: Any) -> Iterator[ClientConnection]:
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
+        if start:
+            tell(socket, "start", **start)
+            assert heard(socket)["type"] == "ready"
+        yield socket
+
+
+def tell(socket: ClientConnection, kind: str, **more: Any) -> None:
+    socket.send(json.dumps({"type": kind, **more}))
+
+
+def heard(socket: ClientConnection) -> dict[str, Any]:
+    text = socket.recv(fakes.WAIT_S)
+    assert isinstance(text, str)
+    parse_server_message(text)
+    message: dict[str, Any] = json.loads(text)
+    return message
+
+
+def closed(socket: ClientConnection) -> tuple[int, str]:
+    with pytest.raises(ConnectionClosed) as caught:
+        socket.recv(fakes.WAIT_S)
+    assert caught.value.rcvd is not None
+    return caught.value.rcvd.code, caught.value.rcvd.reason
+
+
+def all_was_read(socket: ClientConnection) -> None:
+    """Returns when the service has taken in all that was sent before: it answers text at once, and in order."""
+    socket.send("?")
+    assert heard(socket)["code"] == "bad_message"
+
+
+def test_the_five_lines_of_the_readme(url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "road.jpg").write_bytes(fakes.image_file())
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert len([line for line in code.splitlines() if line]) <= 5
+    code = code.replace("ws://127.0.0.1:8000", url.replace("http", "ws")).replace("road.jpg", f"{tmp_path}/road.jpg")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # five lines leave closing the file to Python
+        exec(code, {})  # noqa: S102
+    assert [lane["position"] for lane in json.loads(capsys.readouterr().out)["lanes"]] == [-1, 1]
+
+
+@pytest.mark.parametrize(("offered", "agreed"), [(None, None), (["lanestream.v1"], "lanestream.v1"), (["other"], None)])
+def test_the_subprotocol_is_agreed_on_where_it_is_offered(url: str, offered: Any, agreed: str | None) -> None:
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", subprotocols=offered) as socket:
+        assert socket.subprotocol == agreed
+        assert socket.protocol.extensions == [], "deflate was offered and must be declined"
+
+
+def test_start_is_answered_with_what_runs_and_what_is_accepted(url: str) -> None:
+    with stream(url) as socket:
+        tell(socket, "start", mode="all")
+        ready = heard(socket)
+    assert len(ready.pop("session")) == 16
+    assert ready == {
+        "type": "ready",
+        "mode": "all",
+        "detector": "candidates",
+        "model": "fake 1",
+        "provider": "cpu",
+        "limits": {"max_bytes": 200_000, "max_pixels": 4096 * 2304, "credits": 8},
+    }
+
+
+def test_numbers_and_times_are_the_clients_where_it_gives_them(url: str) -> None:
+    with stream(url, mode="all") as socket:
+        for announced in ({}, {"seq": 7, "timestamp": 3.5}, {"timestamp": -2.0}, {"seq": 3}):
+            if announced:
+                tell(socket, "frame", **announced)
+            socket.send(fakes.image_file())
+        answers = [heard(socket) for _ in range(4)]
+    assert [answer["seq"] for answer in answers] == [0, 7, 8, 3]
+    assert [answer["timestamp"] for answer in answers[1:3]] == [3.5, -2.0]
+    assert all(0.0 <= answers[i]["timestamp"] < 60.0 for i in (0, 3)), "seconds since the stream was opened"
+
+
+def test_end_answers_what_is_held_then_sums_up_and_closes(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    with stream(serve(fakes.engine(network)), mode="all") as socket:
+        for _ in range(3):
+            socket.send(fakes.image_file())
+        socket.send(b"no image")
+        tell(socket, "end")
+        all_was_read(socket)
+        network.let_through(3)
+        assert [heard(socket)["seq"] for _ in range(4)] == [0, 1, 2, 3]
+        summary = heard(socket)
+        assert summary.pop("duration_s") >= 0.0
+        assert summary == {"type": "summary", "frames": 4, "answered": 3, "failed": 1, "dropped": 0}
+        assert closed(socket) == (1000, "")
+
+
+def test_an_end_without_a_frame_is_fine(url: str) -> None:
+    with stream(url) as socket:
+        tell(socket, "end")
+        assert heard(socket)["frames"] == 0
+        assert closed(socket)[0] == 1000
+
+
+BAD_FRAMES = [
+    b"",
+    b"some text, sent as a frame",
+    fakes.image_file()[:2000],
+    fakes.image_file()[:200] + bytes([255, 7]) * 300 + fakes.image_file()[800:],
+    fakes.image_file(".png", 1, 1),
+    fakes.image_file(".png", 8000, 1200, 0),
+    fakes.image_file(shade=255),
+]
+BAD_CODES = ["bad_image"] * 5 + ["image_too_large", "internal"]
+
+
+def test_a_bad_frame_costs_that_frame(url: str) -> None:
+    with stream(url, mode="all") as socket:
+        for seq, (data, code) in enumerate(zip(BAD_FRAMES, BAD_CODES, strict=True)):
+            socket.send(data)
+            told = heard(socket)
+            assert (told["type"], told["seq"], told["code"], told["fatal"]) == ("error", seq, code, False)
+        socket.send(fakes.image_file())
+        assert heard(socket)["seq"] == len(BAD_FRAMES)
+
+
+BAD_TEXTS = [
+    "",
+    "hello",
+    "[]",
+    "{}",
+    '{"type": "stop"}',
+    '{"type": "start", "mode": "some"}',
+    '{"type": "start", "horizon": 1.5}',
+    '{"type": "start", "speed": 1}',
+    '{"type": "frame", "seq": -1}',
+    '{"type": "frame", "timestamp": 1e400}',
+    '{"type": "frame", "timestamp": 1e300}',
+    '{"type": "frame", "timestamp": NaN}',
+    "[" * 100_000,
+]
+
+
+def test_a_bad_text_is_told_and_costs_nothing(url: str) -> None:
+    with stream(url) as socket:
+        for text in BAD_TEXTS:
+            socket.send(text)
+            told = heard(socket)
+            assert (told["type"], told["code"], told["fatal"]) == ("error", "bad_message", False)
+            assert told["message"]
+            assert "\n" not in told["message"]
+        socket.send(fakes.image_file())
+        assert heard(socket)["seq"] == 0
+
+
+def test_a_message_out_of_place_is_told(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    with stream(serve(fakes.engine(network))) as socket:
+        socket.send(fakes.image_file())
+        tell(socket, "start")
+        assert "open already" in heard(socket)["message"]
+        tell(socket, "end")
+        tell(socket, "end")
+        assert "after `end`" in heard(socket)["message"]
+        socket.send(fakes.image_file())
+        assert "after `end`" in heard(socket)["message"]
+        network.let_through()
+        assert heard(socket)["type"] == "lanes"
+        assert heard(socket)["frames"] == 1
+
+
+def test_an_over_run_in_mode_all_ends_the_stream(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    with stream(serve(fakes.engine(network), credits=2), mode="all") as socket:
+        for _ in range(3):
+            socket.send(fakes.image_file())
+        told = heard(socket)
+        network.let_through()
+        assert (told["type"], told["code"], told["fatal"]) == ("error", "overrun", True)
+        assert closed(socket) == (1008, told["message"])
+
+
+def test_an_answer_renews_the_credit(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    with stream(serve(fakes.engine(network), credits=1), mode="all") as socket:
+        network.let_through(50)
+        for seq in range(50):
+            socket.send(fakes.image_file())
+            assert heard(socket)["seq"] == seq
+
+
+def test_newer_frames_replace_waiting_ones_in_mode_latest(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    with stream(serve(fakes.engine(network))) as socket:
+        socket.send(fakes.image_file())
+        network.wait_for_a_frame()
+        for _ in range(5):
+            socket.send(fakes.image_file())
+        all_was_read(socket)
+        network.let_through(2)
+        answers = [heard(socket) for _ in range(2)]
+        assert [(answer["seq"], answer["dropped"]) for answer in answers] == [(0, 4), (5, 4)]
+        tell(socket, "end")
+        assert heard(socket)["dropped"] == 4
+
+
+def test_pings_are_answered_while_the_network_runs(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    with stream(serve(fakes.engine(network))) as socket:
+        for _ in range(20):
+            socket.send(fakes.image_file())
+        network.wait_for_a_frame()
+        assert socket.ping().wait(fakes.WAIT_S)
+        network.let_through(2)
+
+
+def test_more_bytes_than_a_message_may_have_close_the_stream(url: str) -> None:
+    with stream(url, mode="all") as socket:
+        socket.send(bytes(200_001))
+        assert closed(socket)[0] == 1009
+
+
+def test_a_stream_beyond_the_limit_is_refused_until_one_ends(serve: Serve) -> None:
+    place = serve(fakes.engine(), max_sessions=1)
+    with stream(place, mode="all") as first:
+        with stream(place) as second:
+            second.send(fakes.image_file())
+            told = heard(second)
+            assert (told["code"], told["fatal"]) == ("busy", True)
+            assert closed(second)[0] == 1013
+        tell(first, "end")
+        assert heard(first)["type"] == "summary"
+        with stream(place, mode="all"):
+            pass
+
+
+def test_a_client_that_goes_away_in_the_middle_of_a_frame_frees_its_place(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    place = serve(fakes.engine(network), max_sessions=1)
+    with stream(place, mode="all") as socket:
+        socket.send(fakes.image_file())
+        network.wait_for_a_frame()
+    network.let_through(2)
+    with stream(place) as next_one:
+        next_one.send(fakes.image_file())
+        assert heard(next_one)["type"] == "lanes"
+
+
+def test_a_stream_before_the_network_is_loaded_is_told_to_come_again(serve: Serve) -> None:
+    with stream(serve()) as socket:
+        tell(socket, "start")
+        assert heard(socket)["code"] == "not_ready"
+        assert closed(socket)[0] == 1013
+
+
+def test_streams_know_nothing_of_each_other(url: str) -> None:
+    small, large = fakes.image_file(), fakes.image_file(width=640, height=360)
+    with stream(url, mode="all") as one, stream(url, mode="all", horizon=0.3) as other:
+        for seq in range(6):
+            one.send(small)
+            other.send(large)
+            for socket, width, horizon in ((one, 320, 0.4 * 180), (other, 640, 0.3 * 360)):
+                answer = heard(socket)
+                assert (answer["seq"], answer["width"], answer["horizon"]) == (seq, width, horizon)
+                assert [lane["track_id"] for lane in answer["lanes"]] == [1, 2]

@@ -1,0 +1,61 @@
+"""Results told as messages: exact to a hundredth of a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lanestream.lanes import Curve, EgoLane, FrameResult, LaneBoundary, LaneChange
+from lanestream.messages import ProcessedFrame, lanes_message
+from lanestream.protocol import LanesMessage, parse_server_message
+
+STAGES = ("decode", "propose", "queue", "infer", "track", "total")
+
+
+def boundary(curve: Curve, top: float, bottom: float) -> LaneBoundary:
+    covariance = np.diag([1.0 / 3.0, 1e-7 / 3.0, 2e6 / 3.0])
+    return LaneBoundary(5, -1, "predicted", 0.98765, curve, covariance, top, bottom, 1.23456)
+
+
+def told(result: FrameResult) -> LanesMessage:
+    result = FrameResult(result.lanes, result.ego, result.horizon, result.events, dict.fromkeys(STAGES, 1.23456))
+    frame = ProcessedFrame(np.zeros((2160, 3840, 3), np.uint8), result)
+    message = parse_server_message(lanes_message(frame, seq=3, timestamp=0.12, dropped=2).model_dump_json())
+    assert isinstance(message, LanesMessage)
+    return message
+
+
+def test_all_fields_are_told() -> None:
+    lane = boundary(Curve(870.123456789, (1919.5, -1.25, 5000.0)), 1000.0, 2159.0)
+    message = told(FrameResult((lane,), EgoLane(5, None), 870.123456789, (LaneChange(5, "left"),)))
+    assert (message.seq, message.timestamp, message.width, message.height, message.dropped) == (3, 0.12, 3840, 2160, 2)
+    assert (message.horizon, message.timing_ms.total) == (870.12, 1.235)
+    assert message.ego.model_dump() == {"left": 5, "right": None, "offset": None}
+    assert message.events[0].model_dump() == {"type": "lane_change", "track_id": 5, "direction": "left"}
+    (lane_told,) = message.lanes
+    assert (lane_told.track_id, lane_told.position, lane_told.state) == (5, -1, "predicted")
+    assert (lane_told.probability, lane_told.age_s) == (0.9877, 1.235)
+    assert lane_told.covariance[2][2] == 666667.0
+    assert len(lane_told.points) == 24
+    assert lane_told.points[0] == lane_told.line.bottom
+    assert lane_told.points[-1] == lane_told.line.top
+    assert [y for _, y in lane_told.points] == sorted((y for _, y in lane_told.points), reverse=True)
+
+
+@given(
+    horizon=st.floats(100.0, 1500.0),
+    v=st.floats(-500.0, 4500.0),
+    b=st.floats(-4.0, 4.0),
+    k=st.floats(-50_000.0, 50_000.0),
+    top=st.floats(0.1, 0.5),
+)
+def test_curves_and_points_are_exact(horizon: float, v: float, b: float, k: float, top: float) -> None:
+    curve = Curve(horizon, (v, b, k))
+    top_row, bottom = horizon + top * (2159.0 - horizon), 2159.0
+    (lane,) = told(FrameResult((boundary(curve, top_row, bottom),), EgoLane(), horizon)).lanes
+    for y in np.linspace(top_row, bottom, 50):
+        assert lane.x(float(y)) == pytest.approx(float(curve.x(y)), abs=0.01)
+    for x, y in lane.points:
+        assert x == pytest.approx(float(curve.x(y)), abs=0.01)

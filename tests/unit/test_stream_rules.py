@@ -1,0 +1,164 @@
+"""The rules of a stream as plain calls: numbering, mailbox, credits, the end, the count. Time is a number."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lanestream.errors import OverrunError, ProtocolError
+from lanestream.protocol import FrameMessage, Mode, StartMessage
+from lanestream.sessions.stream_rules import StreamRules
+
+
+def opened(mode: Mode, most: int = 3) -> StreamRules:
+    rules = StreamRules(most, now=100.0)
+    rules.start(StartMessage(mode=mode))
+    return rules
+
+
+def next_seq(rules: StreamRules) -> int | None:
+    frame = rules.take()
+    return None if frame is None else frame.seq
+
+
+def counts(rules: StreamRules) -> tuple[int, int, int, int]:
+    summary = rules.summary(101.0)
+    return summary.frames, summary.answered, summary.failed, summary.dropped
+
+
+def test_a_first_frame_opens_the_stream_with_the_defaults() -> None:
+    rules = StreamRules(3, now=100.0)
+    assert not rules.is_open
+    rules.receive(b"x", 100.5)
+    assert rules.is_open
+    assert rules.mode == "latest"
+    with pytest.raises(ProtocolError, match="open already"):
+        rules.start(StartMessage())
+
+
+def test_frames_are_numbered_and_timed_where_the_client_does_not() -> None:
+    rules = opened("all")
+    rules.receive(b"a", 100.5)
+    rules.announce(FrameMessage(seq=41, timestamp=-7.0))
+    rules.announce(FrameMessage(seq=42))
+    rules.receive(b"b", 100.6)
+    rules.receive(b"c", 100.75)
+    taken = []
+    for _ in range(3):
+        frame = rules.take()
+        assert frame is not None
+        taken.append((frame.seq, round(frame.timestamp, 3), frame.data, frame.arrived))
+        rules.settle(answered=True)
+    assert taken == [(0, 0.5, b"a", 100.5), (42, 0.6, b"b", 100.6), (43, 0.75, b"c", 100.75)]
+
+
+def test_one_frame_is_worked_on_at_a_time() -> None:
+    rules = opened("all")
+    rules.receive(b"a", 101.0)
+    rules.receive(b"b", 101.0)
+    assert next_seq(rules) == 0
+    assert next_seq(rules) is None
+    rules.settle(answered=True)
+    assert next_seq(rules) == 1
+
+
+def test_latest_keeps_the_newest_waiting_frame() -> None:
+    rules = opened("latest")
+    rules.receive(b"a", 101.0)
+    assert next_seq(rules) == 0
+    for _ in range(4):
+        rules.receive(b"b", 101.0)
+    assert rules.dropped == 3
+    rules.settle(answered=True)
+    assert next_seq(rules) == 4
+    rules.settle(answered=False)
+    assert counts(rules) == (5, 1, 1, 3)
+
+
+def test_a_frame_whose_turn_has_come_is_not_replaced() -> None:
+    rules = opened("latest")
+    rules.receive(b"a", 101.0)
+    rules.receive(b"b", 101.0)
+    assert rules.dropped == 0
+    rules.receive(b"c", 101.0)
+    assert rules.dropped == 1
+    assert next_seq(rules) == 0
+    rules.settle(answered=True)
+    assert next_seq(rules) == 2
+
+
+def test_all_grants_credits_and_an_answer_renews_one() -> None:
+    rules = opened("all", most=2)
+    rules.receive(b"a", 101.0)
+    rules.receive(b"b", 101.0)
+    with pytest.raises(OverrunError, match="2 frames are unanswered") as caught:
+        rules.receive(b"c", 101.0)
+    assert "grants 2" in caught.value.hint
+    rules.take()
+    with pytest.raises(OverrunError):
+        rules.receive(b"c", 101.0)
+    rules.settle(answered=False)
+    rules.receive(b"c", 101.0)
+    assert counts(rules) == (3, 0, 1, 0)
+
+
+def test_the_end_waits_for_what_is_held() -> None:
+    rules = opened("all")
+    rules.receive(b"a", 101.0)
+    rules.end()
+    assert not rules.finished
+    rules.take()
+    assert not rules.finished
+    rules.settle(answered=True)
+    assert rules.finished
+    assert rules.summary(103.25).duration_s == 3.25
+
+
+def test_nothing_may_follow_the_end() -> None:
+    rules = StreamRules(3, now=0.0)
+    rules.end()
+    assert rules.finished
+    for late in (
+        rules.end,
+        lambda: rules.receive(b"x", 1.0),
+        lambda: rules.announce(FrameMessage()),
+        lambda: rules.start(StartMessage()),
+    ):
+        with pytest.raises(ProtocolError, match="after `end`"):
+            late()
+    assert counts(rules) == (0, 0, 0, 0)
+
+
+@given(mode=st.sampled_from(["latest", "all"]), steps=st.lists(st.sampled_from("rtsf"), max_size=60))
+def test_every_frame_is_answered_failed_or_dropped(mode: Mode, steps: list[str]) -> None:
+    rules = opened(mode, most=4)
+    order: list[int] = []
+    busy = False
+
+    def take() -> bool:
+        frame = rules.take()
+        if frame is not None:
+            order.append(frame.seq)
+        return frame is not None
+
+    for step in steps:
+        if step == "r":
+            try:
+                rules.receive(b"x", 101.0)
+            except OverrunError:
+                assert mode == "all"
+        elif step == "t":
+            busy = take() or busy
+        elif busy:
+            rules.settle(answered=step == "s")
+            busy = False
+    rules.end()
+    while not rules.finished:
+        if busy or take():
+            rules.settle(answered=True)
+            busy = False
+    frames, answered, failed, dropped = counts(rules)
+    assert frames == answered + failed + dropped
+    assert order == sorted(set(order))
+    assert mode == "latest" or dropped == 0
