@@ -1,7 +1,13 @@
 # Each target does its own set-up: on a fresh machine `make demo` and `make test` need only Python 3.11 or later.
 
-PYTHON ?= $(shell command -v python3.13 || command -v python3.12 || command -v python3.11 || command -v python3)
+# The first Python that runs and is new enough: a version manager may have names of versions that it does not have.
+NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))'
+ifndef PYTHON
+PYTHON := $(shell for python in python3.13 python3.12 python3.11 python3; do \
+  "$$python" $(NEW_ENOUGH) 2>/dev/null && echo "$$python" && break; done)
+endif
 VENV := .venv
+comma := ,
 BIN := $(VENV)/bin
 VIDEO ?=
 
@@ -32,8 +38,8 @@ clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(VENV)/bin/python:
-	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "error: Python 3.11 or later is needed, $(PYTHON) is older (set PYTHON=...)" >&2; exit 1; }
+	@"$(PYTHON)" $(NEW_ENOUGH) 2>/dev/null || \
+	  { echo "error: Python 3.11 or later is needed$(if $(PYTHON),$(comma) $(PYTHON) is none) (set PYTHON=...)" >&2; exit 1; }
 	"$(PYTHON)" -m venv $(VENV) || { echo "error: no venv module (on Debian: apt install python3-venv)" >&2; exit 1; }
 
 $(RUN_READY): pyproject.toml | $(VENV)/bin/python

@@ -64,9 +64,6 @@ class InProcess:
         del mode  # nothing waits here that a newer frame could replace
         return LocalStream(self._engine.open_camera(horizon), as_frames(frames))
 
-    def close(self) -> None:
-        """Nothing is held."""
-
 
 class LocalStream:
     """The results of one stream, to be iterated over once; `summary` is there afterwards."""

@@ -47,10 +47,6 @@ class LaneService(Protocol):
         """The lanes of the frames of one camera."""
         ...
 
-    def close(self) -> None:
-        """Gives up what is held."""
-        ...
-
 
 def as_frames(frames: Iterable[SourceFrame | bytes]) -> Iterator[SourceFrame]:
     """Frames of a source as they are; image files numbered from 0, without capture times of their own."""

@@ -59,7 +59,7 @@ def decode(data: bytes, limits: ImageLimits) -> Image:
 
     Raises ImageTooLargeError beyond the limits, and ImageError where it is no image, too small, cut short or corrupt.
     """
-    check_bytes(len(data), limits)
+    _check_bytes(len(data), limits)
     header = read_header(data)
     _check_size(header, limits)
     if not header.complete:
@@ -73,7 +73,7 @@ def decode(data: bytes, limits: ImageLimits) -> Image:
     return np.asarray(image, np.uint8)
 
 
-def check_bytes(size: int, limits: ImageLimits) -> None:
+def _check_bytes(size: int, limits: ImageLimits) -> None:
     """Raises ImageTooLargeError where an image of `size` bytes is more than the limits allow."""
     if size > limits.max_bytes:
         raise ImageTooLargeError(

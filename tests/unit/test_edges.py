@@ -81,7 +81,7 @@ def test_a_bad_setting_is_named(monkeypatch: pytest.MonkeyPatch, name: str, valu
 
 
 def test_a_bad_option_is_named() -> None:
-    with pytest.raises(SettingsError, match="^--max-sessions = 0: "):
+    with pytest.raises(SettingsError, match=r"^--max-sessions = 0: "):
         load_settings(max_sessions=0)
 
 
@@ -99,9 +99,9 @@ def test_errors_of_our_own_tell_nothing() -> None:
 
 
 def test_a_missing_package_is_named_with_the_cure() -> None:
-    with pytest.raises(MissingExtraError, match=r"package no_such_package.*pip install 'lanestream\[video\]'"):
-        with needs_extra("video"):
-            import no_such_package  # noqa: F401
+    told = r"package no_such_package.*pip install 'lanestream\[video\]'"
+    with pytest.raises(MissingExtraError, match=told), needs_extra("video"):
+        import no_such_package  # noqa: F401
 
 
 def test_the_schemas_name_all_messages() -> None:

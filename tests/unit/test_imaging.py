@@ -11,7 +11,7 @@ import fakes
 import pytest
 
 from lanestream.errors import ImageError, ImageTooLargeError
-from lanestream.imaging import Header, ImageLimits, check_bytes, decode, read_header
+from lanestream.imaging import Header, ImageLimits, decode, read_header
 
 LIMITS = ImageLimits()
 KINDS = {".jpg": "JPEG", ".png": "PNG", ".webp": "WebP"}
@@ -70,7 +70,7 @@ def test_an_extended_webp_tells_its_canvas() -> None:
 def test_a_file_that_is_cut_short_anywhere_is_refused(kind: str) -> None:
     data = fakes.image_file(kind)
     for size in {*range(12, 60), *range(60, len(data) - 12, 41)}:
-        with pytest.raises(ImageError, match="cut short|corrupt|kind is unknown"):
+        with pytest.raises(ImageError, match=r"cut short|corrupt|kind is unknown"):
             decode(data[:size], LIMITS)
     assert "its end is missing" in refused(data[:-13])
 
@@ -125,7 +125,6 @@ def test_sizes_are_checked_before_anything_is_decoded() -> None:
         decode(png(30_000, 30_000), LIMITS)
     with pytest.raises(ImageTooLargeError, match="1,001 bytes; at most 1,000"):
         decode(bytes(1001), ImageLimits(max_bytes=1000))
-    check_bytes(1000, ImageLimits(max_bytes=1000))
 
 
 @pytest.mark.parametrize(("width", "height"), [(320, 180), (3840, 2160), (4096, 2160), (64, 64)])

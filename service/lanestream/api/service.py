@@ -42,11 +42,6 @@ class Service:
         self._loaded: Loaded | None = None
 
     @property
-    def ready(self) -> bool:
-        """Whether there is a warm network."""
-        return self._loaded is not None
-
-    @property
     def loaded(self) -> Loaded:
         """The engine and its threads. Raises NotReadyError before `install`."""
         if self._loaded is None:

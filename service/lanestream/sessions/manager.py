@@ -30,9 +30,6 @@ class SessionManager:
         self._limit = limit
         self._open: dict[str, OpenSession] = {}
 
-    def __len__(self) -> int:
-        return len(self._open)
-
     def open(self, engine: Engine, horizon: float | None = None) -> OpenSession:
         """A new session; `horizon` as a share of the image height. Raises BusyError at the limit."""
         if len(self._open) >= self._limit:
