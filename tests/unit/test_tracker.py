@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -64,9 +65,7 @@ def test_ids_stay_and_the_track_settles_on_the_truth() -> None:
 def test_a_late_detection_needs_three_hits() -> None:
     tracker = LaneTracker()
     drive(tracker, 10, lambda _: road(0.0, (0, 1)))
-    counts = []
-    for i in range(10, 14):
-        counts.append(len(tracker.update(road(0.0, (0, 1, 2)), i * DT, VIEW).lanes))
+    counts = [len(tracker.update(road(0.0, (0, 1, 2)), i * DT, VIEW).lanes) for i in range(10, 14)]
     assert counts == [2, 2, 3, 3]
 
 
@@ -98,7 +97,7 @@ def test_covariance_grows_and_probability_fades_while_coasting() -> None:
     drive(tracker, 12, lambda _: both)
     coasted = [tracker.update(both[:1], i * DT, VIEW).lanes[1] for i in range(12, 22)]
     variances = [lane.covariance[0, 0] for lane in coasted]
-    assert all(later > earlier for earlier, later in zip(variances, variances[1:], strict=False))
+    assert all(later > earlier for earlier, later in pairwise(variances))
     assert coasted[-1].probability < coasted[0].probability
 
 
