@@ -111,6 +111,7 @@ class StripGeometry:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Image (columns, rows) that the pixels of a patch are sampled at, each (size, size)."""
         rows = self.rows(top, bottom)
-        across = np.linspace(-1.0, 1.0, self.size)
-        columns = curve.x(rows)[:, None] + self.half_widths(rows, view)[:, None] * across[None, :]
-        return columns.astype(np.float32), np.broadcast_to(rows[:, None], columns.shape).astype(np.float32)
+        across = np.linspace(-1.0, 1.0, self.size, dtype=np.float32)
+        half_widths = self.half_widths(rows, view).astype(np.float32)
+        columns = curve.x(rows).astype(np.float32)[:, None] + half_widths[:, None] * across
+        return columns, np.broadcast_to(rows.astype(np.float32)[:, None], columns.shape)

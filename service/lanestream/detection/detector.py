@@ -13,7 +13,7 @@ from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
 from lanestream.detection.refinement import Refinement
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_rows
-from lanestream.lanes import Curve, Detection, Image
+from lanestream.lanes import Curve, Detection, FloatArray, Image
 
 TRUE_LANE = 1
 
@@ -22,14 +22,16 @@ TRUE_LANE = 1
 class CandidateDetector:
     """Finds boundaries by proposing many and letting the classifier choose.
 
-    A candidate is accepted from the probability `threshold` on. Two accepted boundaries nearer than `separation` times
-    the rows below the horizon, at either of two rows, are one marking, or cross: the more probable one stays.
+    A candidate is accepted from the probability `threshold` on. Candidates that are nowhere more than `same` times the
+    rows below the horizon apart follow the same marking. Of two boundaries that come nearer than `separation`, or that
+    cross, one is wrong: the more probable one stays.
     """
 
     threshold: float = 0.5
     search: CandidateSearch = CandidateSearch()
     cutter: StripCutter = StripCutter()
     refinement: Refinement = Refinement()
+    same: float = 0.12
     separation: float = 0.8
 
     def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
@@ -41,26 +43,37 @@ class CandidateDetector:
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:
         """Detections from the classifier's probabilities (N, 2) for the patches of `prepare`, left to right."""
         probability = outputs[:, TRUE_LANE]
-        order = [int(i) for i in np.argsort(-probability, kind="stable") if probability[i] >= self.threshold]
-        chosen = [prepared.candidates[i] for i in order]
-        fits = self.refinement.refine(prepared.image, chosen, prepared.view)
+        accepted = [int(i) for i in np.argsort(-probability, kind="stable") if probability[i] >= self.threshold]
+        chosen = self._different(accepted, prepared)
+        fits = self.refinement.refine(prepared.image, [prepared.candidates[i] for i in chosen], prepared.view)
         detections = []
-        for index, fit in zip(order, fits, strict=True):
+        for index, fit in zip(chosen, fits, strict=True):
             rows = visible_rows(fit.curve, prepared.view, TOP_SHARE)
             if rows is not None:
                 detections.append(Detection(fit.curve, fit.covariance, *rows, float(probability[index])))
         return sorted(self._apart(detections, prepared.view), key=lambda d: float(d.curve.x(prepared.view.bottom)))
 
+    def _different(self, accepted: Sequence[int], prepared: Prepared) -> list[int]:
+        """Of candidates along one marking the most probable: refinement would move them onto each other anyway."""
+        kept: list[int] = []
+        for index in accepted:
+            curve = prepared.candidates[index].curve
+            gaps = [np.abs(_gaps(curve, prepared.candidates[i].curve, prepared.view)).max() for i in kept]
+            if all(gap > self.same for gap in gaps):
+                kept.append(index)
+        return kept
+
     def _apart(self, detections: Sequence[Detection], view: RoadView) -> list[Detection]:
         """The detections, most probable first, that keep their distance from all better ones."""
         kept: list[Detection] = []
         for detection in detections:
-            if all(self._distance(detection, other, view) > self.separation for other in kept):
+            gaps = [_gaps(detection.curve, other.curve, view) for other in kept]
+            if all(np.abs(gap).min() > self.separation and (gap > 0.0).all() == (gap > 0.0).any() for gap in gaps):
                 kept.append(detection)
         return kept
 
-    def _distance(self, one: Detection, other: Detection, view: RoadView) -> float:
-        """How far apart two boundaries are where they are nearest, over the rows below the horizon; 0 if they cross."""
-        rows = np.array([view.row_at(0.25), view.row_at(0.5), view.row_at(1.0)])
-        gap = (one.curve.x(rows) - other.curve.x(rows)) / (rows - view.horizon)
-        return 0.0 if gap.min() < 0.0 < gap.max() else float(np.abs(gap).min())
+
+def _gaps(one: Curve, other: Curve, view: RoadView) -> FloatArray:
+    """How far apart two curves are at three depths, in rows below the horizon; the sign tells which is on the right."""
+    rows = np.array([view.row_at(0.25), view.row_at(0.5), view.row_at(1.0)])
+    return (one.x(rows) - other.x(rows)) / (rows - view.horizon)

@@ -108,23 +108,27 @@ class PerspectiveSearch:
 
     def _gathering(
         self, hypotheses: NDArray[np.float64], ridges: RidgePoints, width: int, bottom: float
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.float32]:
         """How much each hypothesis (N, 3) of (x, y, bend) gathers: the histogram's variance about its smooth self.
 
         The histogram is that of where the ridges' boundaries cross the bottom row. Scattered points give the same
         variance however far a hypothesis draws them together, so that a high horizon has no advantage.
         """
-        x, y, bend = hypotheses.T[:, :, None]
-        depth = bottom - y
-        below = np.maximum(ridges.y[None, :] - y, 4.0)
-        crossing = x + (ridges.x[None, :] - x - bend * depth**2 / below) * depth / below
+        # Single precision: a hundredth of a pixel on the bottom row, at half the time.
+        x, y, bend = hypotheses.astype(np.float32).T[:, :, None]
+        depth = np.float32(bottom) - y
+        nearness = depth / np.maximum(ridges.y.astype(np.float32) - y, np.float32(4.0))
+        crossing = x + (ridges.x.astype(np.float32) - x - bend * depth * nearness) * nearness
         cells = int(2 * self.reach / self.cell)
-        cell = np.floor((crossing / width - 0.5 + self.reach) / self.cell).astype(np.int64)
-        inside = (cell >= 0) & (cell < cells)
-        index = np.where(inside, cell, cells) + np.arange(len(hypotheses))[:, None] * (cells + 1)
-        weight = np.broadcast_to(ridges.weight, index.shape)
-        counts = np.bincount(index.ravel(), weight.ravel(), minlength=len(hypotheses) * (cells + 1))
-        counts = counts.reshape(len(hypotheses), cells + 1)[:, :cells]
+        # A cell at either end takes what lies beyond.
+        cell = (
+            crossing * np.float32(1.0 / (self.cell * width)) + np.float32((self.reach - 0.5) / self.cell + 1.0)
+        ).astype(np.int32)
+        np.clip(cell, 0, cells + 1, out=cell)
+        cell += np.arange(len(hypotheses), dtype=np.int32)[:, None] * (cells + 2)
+        weight = np.broadcast_to(ridges.weight, cell.shape)
+        counts = np.bincount(cell.ravel(), weight.ravel(), minlength=len(hypotheses) * (cells + 2))
+        counts = counts.reshape(len(hypotheses), cells + 2)[:, 1:-1].astype(np.float32)
         sharp = cv2.blur(counts, (2, 1)) - cv2.blur(counts, (31, 1))
-        gathering: NDArray[np.float64] = (sharp**2).sum(axis=1)
+        gathering: NDArray[np.float32] = (sharp**2).sum(axis=1)
         return gathering
