@@ -29,9 +29,10 @@ Frames = AsyncIterable[SourceFrame] | Iterable[SourceFrame | bytes]
 class AsyncLaneClient:
     """What LaneClient does, for programs that await: the same arguments, results and errors."""
 
-    def __init__(self, url: str = "http://127.0.0.1:8000", timeout: float = _TIMEOUT_S) -> None:
+    def __init__(self, url: str = "http://127.0.0.1:8000", timeout: float = _TIMEOUT_S, in_flight: int = 1) -> None:
         self._endpoint = Endpoint.parse(url)
         self._timeout = timeout
+        self._in_flight = in_flight
         self._http = httpx.AsyncClient(base_url=self._endpoint.http, timeout=timeout)
 
     async def __aenter__(self) -> Self:
@@ -64,7 +65,7 @@ class AsyncLaneClient:
         A source that is no async iterable is read in a thread, because it may block.
         """
         source = frames if isinstance(frames, AsyncIterable) else _in_thread(frames)
-        return AsyncLaneStream(self._endpoint, source, Conversation(mode, horizon), self._timeout)
+        return AsyncLaneStream(self._endpoint, source, Conversation(mode, horizon, self._in_flight), self._timeout)
 
 
 class AsyncLaneStream:

@@ -27,13 +27,16 @@ _TIMEOUT_S: Final = 30.0
 class LaneClient:
     """A Lanestream service at `url`. Waits `timeout` seconds for a connection and for a single image's answer.
 
+    Of a stream, `in_flight` frames are unanswered at a time: one gives the freshest answers, a few hide a slow network.
+
     Raises SettingsError where the URL is none, ConnectionFailedError where the service can't be reached or is lost, and
     the errors that the service tells, as the classes of `lanestream.errors`.
     """
 
-    def __init__(self, url: str = "http://127.0.0.1:8000", timeout: float = _TIMEOUT_S) -> None:
+    def __init__(self, url: str = "http://127.0.0.1:8000", timeout: float = _TIMEOUT_S, in_flight: int = 1) -> None:
         self._endpoint = Endpoint.parse(url)
         self._timeout = timeout
+        self._in_flight = in_flight
         self._http = httpx.Client(base_url=self._endpoint.http, timeout=timeout)
 
     def __enter__(self) -> Self:
@@ -62,10 +65,11 @@ class LaneClient:
     ) -> LaneStream:
         """The lanes of the frames of one camera, in their order, as they come.
 
-        Keeps two frames in flight. A frame that the service refuses gives a result with an `error`, and the stream goes
-        on.
+        A frame that the service refuses gives a result with an `error`, and the stream goes on.
         """
-        return LaneStream(self._endpoint, as_frames(frames), Conversation(mode, horizon), self._timeout)
+        return LaneStream(
+            self._endpoint, as_frames(frames), Conversation(mode, horizon, self._in_flight), self._timeout
+        )
 
 
 class LaneStream:

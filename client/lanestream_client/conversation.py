@@ -1,7 +1,7 @@
 """The client's side of a stream, without its socket: shared by the client that blocks and the one that awaits.
 
-Keeps two frames in flight, one being worked on and one on its way: more would only wait in the service, and make every
-answer older. None has to be dropped of a source that can wait.
+Keeps a few frames in flight, one unless told otherwise: more would wait in the service and make every answer older,
+which pays only where the network is slower than the service. None has to be dropped of a source that can wait.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from lanestream_client.frames import SourceFrame, StreamResult
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
 
-_WINDOW: Final = 2
 _TOO_BIG: Final = 1009
 
 
@@ -45,13 +44,17 @@ class _Pending:
 
 
 class Conversation:
-    """What was sent and what is owed. None of its methods waits; calls from several threads need a lock around them."""
+    """What was sent and what is owed, with up to `in_flight` frames unanswered.
 
-    def __init__(self, mode: Mode, horizon: float | None = None) -> None:
+    None of its methods waits; calls from several threads need a lock around them.
+    """
+
+    def __init__(self, mode: Mode, horizon: float | None = None, in_flight: int = 1) -> None:
         self.ready: ReadyMessage | None = None
         self.summary: SummaryMessage | None = None
         self._mode = mode
         self._horizon = horizon
+        self._in_flight = in_flight
         self._pending: dict[int, _Pending] = {}
         self._last_seq = -1
 
@@ -74,7 +77,7 @@ class Conversation:
         """Whether one more frame may be sent now."""
         if self.ready is None:
             return False
-        window = min(_WINDOW, self.ready.limits.credits)
+        window = min(self._in_flight, self.ready.limits.credits)
         return sum(pending.refused is None for pending in self._pending.values()) < window
 
     def outgoing(self, frame: SourceFrame, data: bytes) -> list[str | bytes]:

@@ -41,7 +41,7 @@ SUMMARY = SummaryMessage(frames=3, answered=3, failed=0, dropped=0, duration_s=1
 
 
 def opened(mode: Mode = "all", most: int = 8) -> Conversation:
-    conversation = Conversation(mode)
+    conversation = Conversation(mode, in_flight=2)
     limits = READY.limits.model_copy(update={"credits": most})
     conversation.opened(READY.model_copy(update={"limits": limits}).model_dump_json())
     return conversation
