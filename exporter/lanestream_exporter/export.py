@@ -14,6 +14,7 @@ import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
+from scipy.special import softmax
 from torch import Tensor, nn
 
 from lanestream.errors import ExportError
@@ -36,6 +37,8 @@ _INT8_MEAN_TOLERANCE = 0.05
 _LARGEST_ACCURACY_LOSS = 0.02
 
 _BATCHES = (1, 4, 16)
+
+_DATA = "rendered scenes; real frames of TuSimple 0313-1 and Udacity, training splits only"
 
 
 @dataclass(frozen=True)
@@ -88,15 +91,18 @@ def export_classifier(
     plain = network.eval().folded()
     roads = _sample(calibration_patches, 1024)
     small = truncated(plain, settings.rank_energy, roads)
-    calibration = calibrated(scores(small, check), check.labels)
+    logits = scores(small, check)
+    calibration = calibrated(logits, check.labels)
+    accuracy = _accuracy(softmax(logits / calibration.temperature, axis=1), check.labels, calibration.threshold)
     served = ServedNetwork(small, calibration.temperature).eval()
     with tempfile.TemporaryDirectory() as folder:
         unfinished = Path(folder) / "model.onnx"
         _to_onnx(served, unfinished)
         if settings.precision == "int8":
             quantized(unfinished, roads[::4])
-        training = {"step": int(state["step"]), "rank_energy": settings.rank_energy}
-        _describe(unfinished, settings, calibration, training)
+        training = {"data": _DATA, "step": int(state["step"]), "rank_energy": settings.rank_energy}
+        metrics = {"validation_patches": len(check), "validation_accuracy": round(accuracy, 4)}
+        _describe(unfinished, settings, calibration, {"training": training, "metrics": metrics})
         report = _proved(unfinished, out, served, calibration, check, settings.precision)
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_bytes(unfinished.read_bytes())
@@ -122,7 +128,7 @@ def _to_onnx(served: ServedNetwork, path: Path) -> None:
     program.save(str(path), external_data=False)
 
 
-def _describe(path: Path, settings: ExportSettings, calibration: Calibration, training: dict[str, Any]) -> None:
+def _describe(path: Path, settings: ExportSettings, calibration: Calibration, record: dict[str, Any]) -> None:
     strip = StripGeometry()
     info = ModelInfo(
         kind="classifier",
@@ -133,7 +139,7 @@ def _describe(path: Path, settings: ExportSettings, calibration: Calibration, tr
         temperature=calibration.temperature,
         threshold=calibration.threshold,
         precision=settings.precision,
-        training=training,
+        **record,
         exporter=f"lanestream {version('lanestream')}, torch {torch.__version__}",
     )
     model = onnx.load(str(path))

@@ -30,7 +30,7 @@ from lanestream_exporter.patchstore import PatchStore
 class TrainSettings:
     """A run's settings; `real_share` of each batch is real, `final_real_share` of it in the last third."""
 
-    steps: int = 1800
+    steps: int = 1900
     batch: int = 96
     learning_rate: float = 3e-4
     weight_decay: float = 0.02

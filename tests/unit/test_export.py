@@ -127,6 +127,7 @@ def test_the_file_describes_itself_and_is_small(exported: Path) -> None:
     info = OnnxModel.load(exported, "cpu").info
     assert (info.kind, info.precision, info.strip.size) == ("classifier", "fp32", 224)
     assert info.training["step"] == 7
+    assert info.metrics["validation_patches"] == 32
     assert exported.stat().st_size < 25e6
 
 

@@ -35,7 +35,8 @@ class ModelInfo(BaseModel):
     temperature: float = Field(gt=0.0, description="Already applied in the graph.")
     threshold: float = Field(gt=0.0, lt=1.0)
     precision: Literal["fp32", "fp16", "int8"]
-    training: dict[str, Any]
+    training: dict[str, Any] = Field(description="What it was trained on, and how far.")
+    metrics: dict[str, Any] = Field(description="What it measured on validation patches when it was exported.")
     exporter: str
 
     @classmethod
