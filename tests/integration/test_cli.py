@@ -243,17 +243,10 @@ def test_an_interrupt_ends_a_stream_with_its_summary(tmp_path: Path, real_engine
         picture = cv2.imdecode(np.frombuffer(fakes.image_file(), np.uint8), cv2.IMREAD_COLOR)
         for number in range(500):
             sink.write(picture, number / 25.0)
-    command = [
-        sys.executable,
-        "-m",
-        "lanestream.cli",
-        "stream",
-        video,
-        "--jsonl",
-        "/dev/stdout",
-        "--video",
-        "drawn.mp4",
-    ]
+    # A shell that starts its tests in the background has them ignore Ctrl-C, and so would whatever they start.
+    heeding = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{heeding}; from lanestream.cli import main; main()"]
+    command += ["stream", str(video), "--jsonl", "/dev/stdout", "--video", "drawn.mp4"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
