@@ -34,7 +34,7 @@ class Mount:
 
 
 _CLIENT: Final = "lanestream_client.commands"
-_SCENES: Final = "lanestream_exporter.commands"
+_SCENES: Final = "lanestream_exporter.scene_commands"
 _NETWORKS: Final = "lanestream_exporter.network_commands"
 _MOUNTS: Final[Mapping[str, Mount]] = {
     "detect": Mount(_CLIENT, "detect", "video", "Find lanes in images."),
