@@ -44,6 +44,8 @@ class OnnxModel:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = cpu_threads()
         options.log_severity_level = 3
+        # Threads that spin while they wait take the processors from those that decode and propose the next frame.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             session = onnxruntime.InferenceSession(
                 str(path), options, providers=list(choice.names), enable_fallback=False
