@@ -37,11 +37,15 @@ _MOST_JPEG_SCANS: Final = 100
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """What is accepted: bytes and pixels at most, and pixels at least on the shorter side."""
+    """What is accepted: bytes and pixels at most, pixels at least on the shorter side, and how elongated it may be.
+
+    Frames are worked on at one width, so that a very tall one would cost more than its pixels tell.
+    """
 
     max_bytes: int = 8 << 20
     max_pixels: int = 4096 * 2304
     min_side: int = 64
+    max_aspect: int = 5
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,11 @@ def _check_size(header: Header, limits: ImageLimits) -> None:
         raise ImageError(
             f"the image is {size}; too small to show a road",
             f"at least {limits.min_side} pixels on each side are accepted, 320 x 180 or more is useful",
+        )
+    if max(header.width, header.height) > limits.max_aspect * min(header.width, header.height):
+        raise ImageError(
+            f"the image is {size}; too elongated to show a road",
+            f"one side may be {limits.max_aspect} times the other at most",
         )
 
 

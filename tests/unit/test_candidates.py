@@ -60,6 +60,17 @@ def test_a_known_horizon_is_kept_but_for_a_nod() -> None:
         assert CandidateSearch().propose(still.image, horizon).view.horizon == pytest.approx(horizon, abs=20.0)
 
 
+@pytest.mark.parametrize("share", [0.0001, 0.1, 0.9, 0.99, 0.9999])
+@pytest.mark.parametrize(("width", "height"), [(64, 64), (320, 64), (64, 320), (640, 360)])
+def test_a_senseless_horizon_does_no_harm(share: float, width: int, height: int) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    detector = CandidateDetector()
+    prepared = detector.prepare(noise, share * height)
+    accepted = np.tile(np.array([[0.0, 1.0]], np.float32), (len(prepared.candidates), 1))
+    assert prepared.view.depth > 0.0
+    assert all(np.isfinite(d.covariance).all() for d in detector.finish(prepared, accepted))
+
+
 @pytest.mark.parametrize(
     "image",
     [

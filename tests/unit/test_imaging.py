@@ -152,3 +152,10 @@ def test_the_second_wall_stands_before_opencv_is_imported() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], input=png(30_000, 30_000), capture_output=True, check=False)
     assert b"CV_IO_MAX_IMAGE_PIXELS" in done.stderr or b"pixels <=" in done.stderr
+
+
+def test_an_elongated_image_is_refused_before_it_is_decoded() -> None:
+    for width, height in ((64, 321), (321, 64)):
+        with pytest.raises(ImageError, match="too elongated"):
+            decode(fakes.image_file(".png", width, height), ImageLimits())
+    assert decode(fakes.image_file(".png", 320, 64), ImageLimits()).shape == (64, 320, 3)

@@ -21,6 +21,9 @@ from lanestream.lanes import Candidate, Curve, Image
 # few pixels wide and every line looks like every other.
 TOP_SHARE = 0.1
 
+# Below this share of the height a horizon leaves no road to look at.
+LOWEST_HORIZON = 0.9
+
 # The two rows, as shares of the depth, at which lines are told, compared and suppressed.
 _NEAR, _FAR = 1.0, 0.45
 
@@ -87,12 +90,15 @@ class CandidateSearch:
     def _road(self, grey: Image, horizon: float | None) -> tuple[Perspective, HoughLines]:
         """The perspective of the working image and the Hough lines of its road."""
         height, width = grey.shape
+        lowest = LOWEST_HORIZON * height
+        horizon = None if horizon is None else min(horizon, lowest)
         top = int(horizon) if horizon is not None else int(0.42 * height)
         lines = self.hough.lines(find_edges(grey, int(np.clip(top, 0, height - 16))), width, height - 1.0)
         first = self.vanishing.find(lines, width, height, horizon)
         guess = Perspective(first.x, first.y, 0.0, first.weight)
         ridges = find_ridges(grey, guess.y)
-        return self.perspective.refine(guess, ridges, width, height - 1.0, horizon is not None), lines
+        point = self.perspective.refine(guess, ridges, width, height - 1.0, horizon is not None)
+        return replace(point, y=min(point.y, lowest)), lines
 
     def _ranked(self, grey: Image, view: RoadView, point: Perspective, lines: HoughLines) -> list[_Line]:
         """Lines of both searches in one order: each list's strengths count against its own strongest."""
