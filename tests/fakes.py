@@ -43,6 +43,7 @@ class FakeNetwork:
 
     name = "fake 1"
     provider = "cpu"
+    reason = "there is nothing else"
     metadata: dict[str, Any] = {"kind": "fake"}  # noqa: RUF012
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:

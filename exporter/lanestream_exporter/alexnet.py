@@ -8,6 +8,7 @@ it is, and folding them leaves exactly the plain network.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -108,14 +109,22 @@ def initialise(network: AlexNet, weights: Path) -> None:
 
     Raises CheckpointError where the file is not one.
     """
-    try:
-        state = torch.load(weights, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises half a dozen types for a file that is not a checkpoint
-        raise CheckpointError(f"{weights} is not a PyTorch checkpoint: {error}", "give a state_dict file") from error
-    if not isinstance(state, dict):
-        raise CheckpointError(f"{weights} holds a {type(state).__name__}", "give a state_dict file")
+    state = load_state(weights)
     wanted = {k: v for k, v in network.state_dict().items() if not k.startswith(("norms.", "classifier.6."))}
     wrong = [key for key, value in wanted.items() if key not in state or state[key].shape != value.shape]
     if wrong:
         raise CheckpointError(f"{weights} lacks {wrong[0]} of a torchvision AlexNet", "give alexnet weights")
     network.load_state_dict({key: state[key] for key in wanted}, strict=False)
+
+
+def load_state(path: Path) -> dict[str, Any]:
+    """The dictionary in a PyTorch file, no code of it run. Raises CheckpointError with one line."""
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint at {path}", "give the path of a .pt file")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load raises half a dozen types, with pages of advice, for what is no checkpoint
+        raise CheckpointError(f"{path} is not a PyTorch checkpoint", "give a file that holds weights alone") from error
+    if not isinstance(state, dict):
+        raise CheckpointError(f"{path} holds a {type(state).__name__}", "give a file that holds a state_dict")
+    return state

@@ -10,13 +10,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lanestream.engine import SHIPPED_MODEL, load_engine
 from lanestream.inference.providers import cpu_threads
+from lanestream_exporter.alexnet import load_state
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.evaluate import Evaluation
 from lanestream_exporter.export import ExportReport, ExportSettings, export_classifier
 from lanestream_exporter.patchstore import PatchStore, read_stores
 from lanestream_exporter.rendering import real_store, rendered_stores
 from lanestream_exporter.score import score as measured
-from lanestream_exporter.train import ClassifierTraining, TrainData, TrainSettings
+from lanestream_exporter.train import ClassifierTraining, TrainData, TrainSettings, read_checkpoint
 from lanestream_exporter.train import Progress as TrainProgress
 
 _DATA = click.option(
@@ -32,9 +33,15 @@ def train() -> None:
 
 @train.command()
 @click.argument("run", type=click.Path(path_type=Path))
-@click.option("--steps", default=TrainSettings.steps, show_default=True, help="Batches to learn from.")
-@click.option("--batch", default=TrainSettings.batch, show_default=True, help="Patches in a batch.")
-@click.option("--rendered", default=20, show_default=True, help="Files of 250 rendered scenes each.")
+@click.option(
+    "--steps", type=click.IntRange(1), default=TrainSettings.steps, show_default=True, help="Batches to learn from."
+)
+@click.option(
+    "--batch", type=click.IntRange(8), default=TrainSettings.batch, show_default=True, help="Patches in a batch."
+)
+@click.option(
+    "--rendered", type=click.IntRange(1), default=20, show_default=True, help="Files of 250 rendered scenes each."
+)
 @click.option("--init", type=click.Path(path_type=Path), help="torchvision's AlexNet weights to start from.")
 @_DATA
 def classifier(run: Path, steps: int, batch: int, rendered: int, init: Path | None, data: Path | None) -> None:
@@ -42,7 +49,10 @@ def classifier(run: Path, steps: int, batch: int, rendered: int, init: Path | No
 
     Renders scenes, cuts patches of them and of the real frames' training split, and mixes the two.
     """
-    stores = _stores(run / "patches", data or data_root(), rendered)
+    if init is not None:
+        load_state(init)  # what is no checkpoint is told now, not after the patches have been made
+    stores = _stores(run / "patches", data_root(data), rendered)
+    click.echo(f"{len(stores.rendered)} rendered and {len(stores.real)} real patches to train on")
     training = ClassifierTraining(TrainSettings(steps=steps, batch=batch), stores, run, init)
     with _progress() as bar:
         task = bar.add_task("training", total=steps)
@@ -70,7 +80,8 @@ def classifier(run: Path, steps: int, batch: int, rendered: int, init: Path | No
 @_DATA
 def export(checkpoint: Path, out: Path, precision: str, rank_energy: float, data: Path | None) -> None:
     """Write CHECKPOINT as the ONNX file OUT that serves, after proving that it does the same."""
-    root = data or data_root()
+    root = data_root(data)
+    read_checkpoint(checkpoint)  # what is no checkpoint is told now, not after the patches have been made
     folder = checkpoint.parent / "patches"
     train_patches = read_stores([real_store(folder, root, "train")])
     check = read_stores([real_store(folder, root, "val")])
@@ -88,7 +99,7 @@ def evaluate(model: Path, split: str, json_path: Path | None, data: Path | None)
 
     Prints candidates (precision, recall, accuracy, proposal recall), and boundaries of single images and of clips.
     """
-    root = data or data_root()
+    root = data_root(data)
     engine = load_engine(model, "cpu")
     evaluation = Evaluation(engine)
     figures = {

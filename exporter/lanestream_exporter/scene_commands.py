@@ -32,7 +32,7 @@ class SizeType(click.ParamType[tuple[int, int]]):
 
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path, dir_okay=False), metavar="OUT.mp4")
-@click.option("--seed", default=24, show_default=True, help="Another seed, another road.")
+@click.option("--seed", type=click.IntRange(0), default=24, show_default=True, help="Another seed, another road.")
 @click.option("--seconds", default=8.0, show_default=True, type=click.FloatRange(0.1, 600.0))
 @click.option("--fps", default=25.0, show_default=True, type=click.FloatRange(1.0, 120.0))
 @click.option("--size", default="1280x720", show_default=True, type=SizeType())

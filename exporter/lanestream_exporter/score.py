@@ -39,9 +39,11 @@ def score(results: Path, labels: Path) -> dict[str, Any]:
 
 def _messages(path: Path) -> list[LanesMessage]:
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise SourceError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
+    except UnicodeDecodeError:
+        raise SourceError(f"{path} is not a text file", "give what `--jsonl` wrote") from None
     messages = []
     for number, line in enumerate(lines, start=1):
         try:

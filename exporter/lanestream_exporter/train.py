@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lanestream.errors import CheckpointError
-from lanestream_exporter.alexnet import AlexNet, initialise, normalise
+from lanestream_exporter.alexnet import AlexNet, initialise, load_state, normalise
 from lanestream_exporter.augment import augmented
 from lanestream_exporter.patchstore import PatchStore
 
@@ -209,11 +209,8 @@ def log_loss(network: AlexNet, store: PatchStore) -> float:
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """A checkpoint of this module. Raises CheckpointError with what to do about it."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises half a dozen types for a file that is not a checkpoint
-        raise CheckpointError(f"{path} is not a checkpoint: {error}", "delete it, or name another one") from error
-    if not isinstance(state, dict) or "network" not in state:
+    state = load_state(path)
+    if "network" not in state:
         raise CheckpointError(f"{path} is not a checkpoint of this trainer", "give the best.pt of a run")
     return state
 

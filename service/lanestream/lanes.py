@@ -61,15 +61,13 @@ class Candidate:
     """A possible boundary, straight from the extended Hough transform.
 
     `top` and `bottom` are the rows between which it is in view and on the road. `strength` orders candidates of one
-    frame (more is better). `marking_width` is the distance between its two edges divided by the distance of the row
-    from the horizon, the same at every row of a flat road; None for a single unpaired edge.
+    frame (more is better).
     """
 
     curve: Curve
     top: float
     bottom: float
     strength: float
-    marking_width: float | None = None
 
 
 @dataclass(frozen=True)

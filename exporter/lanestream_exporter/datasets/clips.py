@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from lanestream.errors import LabelError, SourceError
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.records import records, unusable
 
 
 def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, LabelledFrame]:
@@ -21,12 +21,11 @@ def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, Labelled
     Raises LabelError that names the file and the line.
     """
     frames: dict[int, LabelledFrame] = {}
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for place, record in records(path):
         try:
-            record = json.loads(line)
             frames[int(record["frame"])] = _frame(record, path, exhaustive)
         except (ValueError, KeyError, TypeError) as error:
-            raise LabelError(f"{path}:{number}: {error!r}", "a record needs frame, width, height and lanes") from error
+            raise unusable(place, error, "frame, width, height and lanes") from error
     return frames
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from lanestream.errors import LabelError
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.clips import read_clip, read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.records import records
 from lanestream_exporter.datasets.tusimple import read_tusimple
 
 Split = Literal["train", "val", "test"]
@@ -30,14 +30,14 @@ _CLIPS: dict[Split, tuple[str, ...]] = {
 _COUNTRY_FRAMES: dict[Split, range] = {"train": range(2000), "val": range(2000, 2400), "test": range(2400, 2800)}
 
 
-def data_root() -> Path:
-    """The folder of real frames: `$LANESTREAM_DATA`, else `../shared/data` beside the project.
+def data_root(given: Path | None = None) -> Path:
+    """The folder of real frames: the `given` one, else `$LANESTREAM_DATA`, else `../shared/data`.
 
-    Raises LabelError where there is none.
+    Raises LabelError where no labelled frames are in it.
     """
-    root = Path(os.environ.get("LANESTREAM_DATA", "../shared/data"))
+    root = given or Path(os.environ.get("LANESTREAM_DATA", "../shared/data"))
     if not (root / "tusimple" / "labels.jsonl").is_file():
-        raise LabelError(f"no labelled frames in {root}", "set LANESTREAM_DATA to the data folder")
+        raise LabelError(f"no labelled frames in {root}", "give the data folder with --data or in LANESTREAM_DATA")
     return root
 
 
@@ -79,7 +79,7 @@ def labelled_clips(root: Path, split: Split) -> list[LabelledClip]:
 def _country_frames(root: Path, wanted: range) -> Iterator[tuple[LabelledFrame, Image]]:
     """Labelled frames of the country road from the original JPEGs, which the video has compressed once more."""
     labels = root / "labels.jsonl"
-    images = {int(r["frame"]): str(r["image"]) for r in map(json.loads, labels.read_text().splitlines())}
+    images = {int(record["frame"]): str(record["image"]) for _, record in records(labels)}
     for index, frame in read_clip_labels(labels, exhaustive=True).items():
         if index in wanted:
             image = cv2.imread(str(root / images[index]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from lanestream.errors import LabelError
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.records import records, unusable
 
 _WIDTH, _HEIGHT = 1280, 720
 
@@ -23,18 +23,16 @@ def read_tusimple(root: Path, split: str | None = None) -> Iterator[tuple[Labell
     Labels are not exhaustive: what lies outside the outermost one is unknown. Raises LabelError that names the file and
     the line.
     """
-    path = root / "labels.jsonl"
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for place, record in records(root / "labels.jsonl"):
         try:
-            record = json.loads(line)
             if split is not None and record["split"] != split:
                 continue
             frame = _frame(record)
         except (ValueError, KeyError, TypeError) as error:
-            raise LabelError(f"{path}:{number}: {error!r}", "a record needs raw_file, h_samples and lanes") from error
+            raise unusable(place, error, "raw_file, split, h_samples and lanes") from error
         image = cv2.imread(str(root / frame.source))
         if image is None:
-            raise LabelError(f"{path}:{number}: {frame.source} can't be read as an image")
+            raise LabelError(f"{place}: {frame.source} can't be read as an image")
         yield frame, np.asarray(image, dtype=np.uint8)
 
 

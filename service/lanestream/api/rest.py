@@ -34,7 +34,7 @@ _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["schema"]}, "required": ["file"]}}
 
 
-class ModelInfo(BaseModel):
+class ModelEntry(BaseModel):
     """A loaded network: its name and version, what runs it, and what its file says of itself."""
 
     name: str
@@ -46,7 +46,7 @@ class ModelInfo(BaseModel):
 class ModelList(BaseModel):
     """The networks of the service; the first is the default."""
 
-    models: list[ModelInfo]
+    models: list[ModelEntry]
 
 
 class Problem(BaseModel):
@@ -106,7 +106,7 @@ async def detect(
 async def models(request: Request) -> ModelList:
     """The network that runs, and what really runs it."""
     network = _service(request).loaded.engine.network
-    info = ModelInfo(
+    info = ModelEntry(
         name=network.name, detector="candidates", provider=network.provider, metadata=dict(network.metadata)
     )
     return ModelList(models=[info])

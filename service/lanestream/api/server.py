@@ -73,7 +73,8 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
     try:
         engine = await asyncio.to_thread(load)
         app.state.service.install(engine)
-        _log.info("ready: %s on %s", engine.network.name, engine.network.provider)
+        network = engine.network
+        _log.info("ready: %s on %s (%s)", network.name, network.provider, network.reason)
     except BaseException:
         server.should_exit = True
         await serving

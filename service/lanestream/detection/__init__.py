@@ -61,6 +61,11 @@ class Network(Protocol):
         ...
 
     @property
+    def reason(self) -> str:
+        """Why that one."""
+        ...
+
+    @property
     def metadata(self) -> dict[str, Any]:
         """What the model file says of itself."""
         ...

@@ -47,7 +47,6 @@ class _Line:
     near: float
     far: float
     strength: float
-    width: float | None = None
 
 
 @dataclass(frozen=True)
@@ -124,10 +123,7 @@ class CandidateSearch:
         # Paint is narrow: pairs wider than a single marking count less, down to a half for a double line.
         narrow = np.clip(1.3 - 2.0 * width[i, j], 0.5, 1.0)
         strength = 2.0 * np.sqrt(lines.votes[a] * lines.votes[b]) * narrow * _aimed(*between, view, point)
-        return [
-            _Line(float(n), float(f), float(s), float(w))
-            for n, f, s, w in zip(*between, strength, width[i, j], strict=True)
-        ]
+        return [_Line(float(n), float(f), float(s)) for n, f, s in zip(*between, strength, strict=True)]
 
     def _singles(self, lines: HoughLines, view: RoadView, point: Perspective) -> list[_Line]:
         """Unpaired edges, second class: a worn marking, a road edge, one side of a wide band."""
@@ -193,4 +189,4 @@ def _candidate(line: _Line, curve: Curve, view: RoadView) -> Candidate | None:
     rows = visible_rows(curve, view, TOP_SHARE)
     if rows is None or rows[1] - rows[0] < 0.15 * view.depth:
         return None
-    return Candidate(curve, rows[0], rows[1], line.strength, line.width)
+    return Candidate(curve, rows[0], rows[1], line.strength)
