@@ -35,15 +35,17 @@ class Mount:
 
 _CLIENT: Final = "lanestream_client.commands"
 _SCENES: Final = "lanestream_exporter.scene_commands"
-_NETWORKS: Final = "lanestream_exporter.network_commands"
+_TRAINING: Final = "lanestream_exporter.training_commands"
+_EXPORT: Final = "lanestream_exporter.export_commands"
+_EVALUATION: Final = "lanestream_exporter.evaluation_commands"
 _MOUNTS: Final[Mapping[str, Mount]] = {
     "detect": Mount(_CLIENT, "detect", "video", "Find lanes in images."),
     "stream": Mount(_CLIENT, "stream", "video", "Follow the lanes of one camera."),
     "scene": Mount(_SCENES, "scene", "video", "Render a clip of a road, with exact labels."),
-    "train": Mount(_NETWORKS, "train", "train,service,cpu", "Train a network."),
-    "export": Mount(_NETWORKS, "export", "export,service,cpu", "Turn a checkpoint into a model file."),
-    "evaluate": Mount(_NETWORKS, "evaluate", "export,service,cpu", "Measure a model's accuracy."),
-    "score": Mount(_NETWORKS, "score", "export,service,cpu", "Measure a stream's results against labels."),
+    "train": Mount(_TRAINING, "train", "train,service,cpu", "Train a network."),
+    "export": Mount(_EXPORT, "export", "export,service,cpu", "Turn a checkpoint into a model file."),
+    "evaluate": Mount(_EVALUATION, "evaluate", "export,service,cpu", "Measure a model's accuracy."),
+    "score": Mount(_EVALUATION, "score", "export,service,cpu", "Measure a stream's results against labels."),
 }
 
 
