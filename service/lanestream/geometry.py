@@ -115,3 +115,25 @@ class StripGeometry:
         half_widths = self.half_widths(rows, view).astype(np.float32)
         columns = curve.x(rows).astype(np.float32)[:, None] + half_widths[:, None] * across
         return columns, np.broadcast_to(rows.astype(np.float32)[:, None], columns.shape)
+
+
+@dataclass(frozen=True)
+class CanvasGeometry:
+    """The canonical picture of a road: `size` x `size` network pixels in which the horizon has a fixed place.
+
+    Its rows run from `above` of the depth over the horizon down to the bottom of the image. Its columns reach half the
+    image's width to either side of the middle at the bottom and `narrowest` of that at the horizon: what is far away is
+    small, and shown larger.
+    """
+
+    size: int = 224
+    above: float = 0.12
+    narrowest: float = 0.6
+
+    def grid(self, view: RoadView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Image (columns, rows) that the canvas pixels are sampled at, each (size, size)."""
+        shares = np.linspace(-self.above, 1.0, self.size)
+        reach = 0.5 * view.width * (self.narrowest + (1.0 - self.narrowest) * np.maximum(shares, 0.0))
+        across = np.linspace(-1.0, 1.0, self.size)
+        columns = (view.width - 1) / 2.0 + reach[:, None] * across[None, :]
+        return columns, np.broadcast_to(view.row_at(0.0) + shares[:, None] * view.depth, columns.shape)

@@ -47,7 +47,7 @@ def test_an_oracle_network_gives_exact_boundaries(width: int, height: int) -> No
     assert prepared.inputs.shape == (len(prepared.candidates), 224, 224, 3)
     verdicts = TruthRule(near=16.0).judge(prepared.candidates, still.labels, prepared.view)
     outputs = np.stack([verdicts != TRUE, verdicts == TRUE], axis=1).astype(np.float32)
-    found = [Found(d.curve, d.top, d.bottom, 0) for d in detector.finish(prepared, outputs)]
+    found = [Found(d.curve, d.top, d.bottom, 0) for d in detector.finish(prepared, outputs).detections]
     tally = Tally()
     count(tally, found, ego_labels(still.labels), still.labels)
     assert tally.missed == 0
@@ -68,7 +68,7 @@ def test_a_senseless_horizon_does_no_harm(share: float, width: int, height: int)
     prepared = detector.prepare(noise, share * height)
     accepted = np.tile(np.array([[0.0, 1.0]], np.float32), (len(prepared.candidates), 1))
     assert prepared.view.depth > 0.0
-    assert all(np.isfinite(d.covariance).all() for d in detector.finish(prepared, accepted))
+    assert all(np.isfinite(d.covariance).all() for d in detector.finish(prepared, accepted).detections)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_images_without_a_road_do_no_harm(image: NDArray[np.uint8]) -> None:
     detector = CandidateDetector()
     prepared = detector.prepare(image)
     accepted = np.tile(np.array([[0.0, 1.0]], np.float32), (len(prepared.candidates), 1))
-    for detection in detector.finish(prepared, accepted):
+    for detection in detector.finish(prepared, accepted).detections:
         assert np.isfinite(detection.curve.coefficients).all()
         assert np.isfinite(detection.covariance).all()
 

@@ -21,8 +21,8 @@ from lanestream.lanes import Candidate, Curve, Detection, Image
 class Prepared:
     """A frame on its way through a detector: network inputs (N, H, W, 3) uint8, and what `finish` needs again.
 
-    `view` is the frame's road view with the horizon found in it, and `horizon_weight` (0 to 1) tells how much the frame
-    had to say about that.
+    `view` is the road view that the inputs were made in, and `horizon_weight` (0 to 1) tells how much of its horizon
+    was found in this frame.
     """
 
     image: Image
@@ -30,6 +30,18 @@ class Prepared:
     view: RoadView
     candidates: tuple[Candidate, ...] = ()
     horizon_weight: float = 0.0
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a detector found in a frame: boundaries from left to right, and the road view with the horizon it found.
+
+    `horizon_weight` (0 to 1) tells how much the frame had to say about where its horizon is.
+    """
+
+    detections: tuple[Detection, ...]
+    view: RoadView
+    horizon_weight: float
 
 
 class LaneDetector(Protocol):
@@ -42,8 +54,8 @@ class LaneDetector(Protocol):
         """
         ...
 
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:
-        """Detections from the network's outputs for `prepared.inputs`, row by row."""
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
+        """What the network's outputs for `prepared.inputs`, row by row, say of the frame."""
         ...
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Prepared
+from lanestream.detection import Findings, Prepared
 from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
 from lanestream.detection.refinement import Refinement
 from lanestream.detection.strips import StripCutter
@@ -40,7 +40,7 @@ class CandidateDetector:
         patches = self.cutter.cut(image, proposals.candidates, proposals.view)
         return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)
 
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
         """Detections from the classifier's probabilities (N, 2) for the patches of `prepare`, left to right."""
         probability = outputs[:, TRUE_LANE]
         accepted = [int(i) for i in np.argsort(-probability, kind="stable") if probability[i] >= self.threshold]
@@ -51,7 +51,8 @@ class CandidateDetector:
             rows = visible_rows(fit.curve, prepared.view, TOP_SHARE)
             if rows is not None:
                 detections.append(Detection(fit.curve, fit.covariance, *rows, float(probability[index])))
-        return sorted(self._apart(detections, prepared.view), key=lambda d: float(d.curve.x(prepared.view.bottom)))
+        apart = sorted(self._apart(detections, prepared.view), key=lambda d: float(d.curve.x(prepared.view.bottom)))
+        return Findings(tuple(apart), prepared.view, prepared.horizon_weight)
 
     def _different(self, accepted: Sequence[int], prepared: Prepared) -> list[int]:
         """Of candidates along one marking the most probable: refinement would move them onto each other anyway."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import LaneDetector, Prepared
+from lanestream.detection import Findings, LaneDetector, Prepared
 from lanestream.lanes import FrameResult, Image
 from lanestream.tracking import LaneTracker
 
@@ -41,17 +41,17 @@ class Session:
         `timestamp` is the capture time in seconds. Frames of a session are concluded one at a time, in order.
         """
         view = prepared.view
+        findings = self._detector.finish(prepared, outputs)
         if self._size not in (None, (view.width, view.height)):
             self._tracker = LaneTracker()
             self._estimate, self._evidence = None, 0.0
         self._size = (view.width, view.height)
-        detections = self._detector.finish(prepared, outputs)
-        self._steady_horizon(prepared)
-        return self._tracker.update(detections, timestamp, view)
+        self._steady_horizon(findings)
+        return self._tracker.update(findings.detections, timestamp, findings.view)
 
-    def _steady_horizon(self, prepared: Prepared) -> None:
+    def _steady_horizon(self, findings: Findings) -> None:
         """A mean of what the frames say, weighed by how much they have to say, that forgets slowly."""
-        share = prepared.view.horizon / prepared.view.height
-        self._evidence += prepared.horizon_weight
-        gain = max(_HORIZON_GAIN * prepared.horizon_weight, prepared.horizon_weight / max(self._evidence, 1e-6))
+        share = findings.view.horizon / findings.view.height
+        self._evidence += findings.horizon_weight
+        gain = max(_HORIZON_GAIN * findings.horizon_weight, findings.horizon_weight / max(self._evidence, 1e-6))
         self._estimate = share if self._estimate is None else self._estimate + gain * (share - self._estimate)

@@ -1,0 +1,190 @@
+"""Frames for the regressor, kept small: pictures at the width that it looks at, boundaries and horizon beside them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lanestream.detection.edges import resized
+from lanestream.detection.regression import RegressionDetector
+from lanestream.errors import LabelError
+from lanestream.geometry import Scaling
+from lanestream.lanes import FloatArray, Image
+from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.splits import Split, real_frames
+from lanestream_exporter.scenes import render_still, sample_scene
+
+SCENES_PER_FILE = 250
+
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
+_SIZES = ((448, 252), (448, 336), (640, 360))
+_SHARES = (0.5, 0.35, 0.15)
+
+
+@dataclass(frozen=True)
+class RoadFrame:
+    """A frame as the regressor learns from it: its picture as JPEG bytes, and in pixels of that picture its boundaries.
+
+    `lanes` are polylines (N, 2) from the lowest row upwards; `horizon` is the row at which they meet. `exhaustive` says
+    that what is not labelled is not there.
+    """
+
+    jpeg: bytes
+    width: int
+    height: int
+    lanes: tuple[FloatArray, ...]
+    horizon: float
+    exhaustive: bool
+
+    def image(self) -> Image:
+        """The picture, BGR (H, W, 3)."""
+        return np.asarray(cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
+
+    @classmethod
+    def of(cls, frame: LabelledFrame, image: Image, about: float | None = None) -> RoadFrame | None:
+        """A labelled frame made small; None where its labels don't tell a horizon and `about` doesn't either."""
+        scaling = Scaling(min(1.0, RegressionDetector.detail_width / frame.width))
+        lanes = tuple(
+            np.stack([(lane.points[:, i] + 0.5) * scaling.factor - 0.5 for i in (0, 1)], axis=1)
+            for lane in frame.lanes
+            if len(lane.points) >= 3
+        )
+        small = resized(image, scaling)
+        height, width = small.shape[:2]
+        expected = None if about is None else scaling.to_working(about)
+        horizon = shared_horizon(lanes, height, expected)
+        if horizon is None:
+            return None
+        jpeg = cv2.imencode(".jpg", small, _JPEG)[1].tobytes()
+        return cls(jpeg, width, height, lanes, horizon, frame.exhaustive)
+
+
+def shared_horizon(lanes: Sequence[FloatArray], height: int, expected: float | None) -> float | None:
+    """The row under which all boundaries keep to one vanishing point and one bend; None where that can't be told.
+
+    `lanes` are polylines (N, 2). The model is x = v + b (y - h) + k / (y - h) with v, h and k shared; `expected` is
+    about h, where it is known, and draws the answer to it by half where only one boundary is labelled.
+    """
+    lowest = min((float(lane[:, 1].min()) for lane in lanes), default=0.0)
+    rows = np.arange(0.15 * height, min(lowest, 0.8 * height) - 1.0, 0.5)
+    if expected is not None:
+        rows = rows[np.abs(rows - expected) <= 0.08 * height]
+    if not lanes or (len(lanes) < 2 and expected is None) or not len(rows):
+        return expected
+    spread = 0.03 * height
+    costs = [_misfit(lanes, h) + (0.0 if expected is None else ((h - expected) / spread) ** 2) for h in rows]
+    return float(rows[int(np.argmin(costs))])
+
+
+def _misfit(lanes: Sequence[FloatArray], horizon: float) -> float:
+    """Squared residuals of all lanes under the shared model, each point to about a pixel."""
+    blocks, targets = [], []
+    for index, lane in enumerate(lanes):
+        u = lane[:, 1] - horizon
+        own = np.zeros((len(u), len(lanes)))
+        own[:, index] = u
+        weight = np.sqrt(20.0 / len(u))
+        blocks.append(weight * np.hstack([np.ones((len(u), 1)), 100.0 / u[:, None], own]))
+        targets.append(weight * lane[:, 0])
+    design, target = np.concatenate(blocks), np.concatenate(targets)
+    solution = np.linalg.lstsq(design, target, rcond=None)[0]
+    return float(((design @ solution - target) ** 2).sum())
+
+
+def rendered_frames(folder: Path, files: int, workers: int, done: Callable[[Path], None]) -> list[Path]:
+    """`files` files of `SCENES_PER_FILE` rendered frames each, numbered by seed; those already there are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"frames-{number:04d}.npz" for number in range(files)]
+    missing = [(number, path) for number, path in enumerate(paths) if not path.exists()]
+    # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        running = {pool.submit(_render_file, number, path): path for number, path in missing}
+        for future in as_completed(running):
+            future.result()
+            done(running[future])
+    return paths
+
+
+def real_road_frames(root: Path, split: Split) -> list[RoadFrame]:
+    """The labelled real frames of a split; those with a single boundary have the horizon of their drive."""
+    drives: dict[str, list[tuple[LabelledFrame, Image]]] = {}
+    for frame, image in real_frames(root, split):
+        drives.setdefault(frame.group, []).append((frame, image))
+    frames = []
+    for drive in drives.values():
+        first = [RoadFrame.of(frame, image) for frame, image in drive]
+        told = [f.horizon / f.height for f in first if f is not None]
+        usual = float(np.median(told)) if told else None
+        for frame, image in drive:
+            small = RoadFrame.of(frame, image, None if usual is None else usual * frame.height)
+            frames += [] if small is None else [small]
+    return frames
+
+
+def write_frames(path: Path, frames: Iterable[RoadFrame]) -> int:
+    """Writes frames to `path` (.npz), whole or not at all; returns how many."""
+    kept = list(frames)
+    data = np.frombuffer(b"".join(f.jpeg for f in kept), np.uint8)
+    sizes = np.array([len(f.jpeg) for f in kept], dtype=np.int64)
+    notes = json.dumps([_note(f) for f in kept])
+    unfinished = path.with_suffix(".part.npz")
+    np.savez(unfinished, data=data, sizes=sizes, notes=np.frombuffer(notes.encode(), np.uint8))
+    unfinished.replace(path)
+    return len(kept)
+
+
+def read_frames(path: Path) -> list[RoadFrame]:
+    """The frames in a file of `write_frames`. Raises LabelError for a file that is none."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data, sizes, notes = file["data"], file["sizes"], json.loads(file["notes"].tobytes())
+    except (OSError, ValueError, KeyError) as error:
+        raise LabelError(f"{path} is not a file of frames: {error}", "delete it to have it made again") from error
+    ends = np.cumsum(sizes)
+    return [
+        RoadFrame(
+            data[end - size : end].tobytes(), note["width"], note["height"],
+            tuple(np.asarray(lane, dtype=float) for lane in note["lanes"]), note["horizon"], note["exhaustive"],
+        )
+        for end, size, note in zip(ends, sizes, notes, strict=True)
+    ]  # fmt: skip
+
+
+def _note(frame: RoadFrame) -> dict[str, object]:
+    return {
+        "width": frame.width,
+        "height": frame.height,
+        "lanes": [np.round(lane, 3).tolist() for lane in frame.lanes],
+        "horizon": frame.horizon,
+        "exhaustive": frame.exhaustive,
+    }
+
+
+def _render_file(number: int, path: Path) -> None:
+    cv2.setNumThreads(1)
+    write_frames(path, _rendered(number))
+
+
+def _rendered(number: int) -> Iterator[RoadFrame]:
+    for index in range(SCENES_PER_FILE):
+        rng = np.random.default_rng([number, index, 2])
+        width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
+        still = render_still(sample_scene(rng, width, height))
+        frame = RoadFrame.of(_near(still.labels), still.image, still.horizon)
+        if frame is not None:
+            yield frame
+
+
+def _near(frame: LabelledFrame) -> LabelledFrame:
+    """The labels without what lies beyond the next lanes: it bounds no lane that the camera could be in soon."""
+    lanes: tuple[LabelledLane, ...] = tuple(
+        lane for lane in frame.lanes if lane.position is None or abs(lane.position) <= 2
+    )
+    return LabelledFrame(frame.width, frame.height, lanes, frame.group, frame.source, frame.exhaustive)

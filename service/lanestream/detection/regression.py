@@ -1,0 +1,128 @@
+"""The second detector: a network that looks at the whole road at once and tells the ego lane's two boundaries.
+
+The frame is warped to a canonical picture, in which the horizon has its place, and the network answers with where each
+boundary runs, how sure it is of that, whether the boundary is there at all, and where the horizon really is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.detection import Findings, Prepared
+from lanestream.detection.edges import resized
+from lanestream.geometry import CanvasGeometry, RoadView, Scaling, visible_rows
+from lanestream.lanes import Curve, Detection, FloatArray, Image, curve_basis
+
+# A boundary is told by its columns at these shares of the depth below the horizon.
+ANCHORS: Final = (1.0, 0.4, 0.15)
+
+# What the network answers: columns of the left and the right boundary at the anchors, in image widths from the middle;
+# their standard deviations likewise; the chance that each boundary is there; the horizon's distance from where the
+# canvas took it to be, in depths, positive downwards.
+OUTPUTS: Final = 15
+
+# Where cameras look: the horizon of a frame of which nothing is known, as a share of its height.
+USUAL_HORIZON: Final = 0.46
+
+_TOP_SHARE: Final = 0.1
+
+
+@dataclass(frozen=True)
+class RoadReading:
+    """The network's answer for one frame, in shares of the frame.
+
+    `columns` (2, 3) and `deviations` (2, 3) of the left and the right boundary at the anchors, in image widths from the
+    middle; `presence` (2,) from 0 to 1; `horizon` in depths below where it was taken to be.
+    """
+
+    columns: FloatArray
+    deviations: FloatArray
+    presence: FloatArray
+    horizon: float
+
+    @classmethod
+    def of(cls, output: NDArray[np.float32]) -> RoadReading:
+        """The reading in one row (15,) of the network's outputs."""
+        values = np.asarray(output, dtype=np.float64)
+        return cls(values[:6].reshape(2, 3), values[6:12].reshape(2, 3), values[12:14], float(values[14]))
+
+    def view(self, assumed: RoadView) -> RoadView:
+        """The road view with the horizon where the network sees it."""
+        horizon = assumed.horizon + self.horizon * assumed.depth
+        return RoadView(assumed.width, assumed.height, float(np.clip(horizon, 0.0, 0.9 * assumed.height)))
+
+    def curve(self, side: int, view: RoadView) -> Curve:
+        """The boundary on `side` (0 left, 1 right) in pixels of `view`, the view with the network's horizon."""
+        return Curve.through(view.horizon, _anchor_rows(view), _middle(view) + self.columns[side] * view.width)
+
+    def covariance(self, side: int, view: RoadView) -> FloatArray:
+        """The covariance (3, 3) of that curve's coefficients."""
+        to_curve = np.linalg.inv(curve_basis(view.horizon, _anchor_rows(view)))
+        variance = (self.deviations[side] * view.width) ** 2
+        return np.asarray((to_curve * variance) @ to_curve.T)
+
+
+@dataclass(frozen=True)
+class RegressionDetector:
+    """Finds the ego lane's boundaries with one look at the whole frame.
+
+    A boundary is told from the presence `threshold` on. `detail_width` is the width that frames are reduced to before
+    they are warped, so that near rows do not alias.
+    """
+
+    threshold: float = 0.5
+    geometry: CanvasGeometry = CanvasGeometry()
+    detail_width: int = 448
+
+    def prepare(
+        self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()  # noqa: ARG002
+    ) -> Prepared:  # fmt: skip
+        """The canonical picture (1, size, size, 3) of a BGR image; `horizon` is about its row, where known.
+
+        `expected` boundaries are of no use here: the network looks at every frame afresh.
+        """
+        height, width = image.shape[:2]
+        row = USUAL_HORIZON * height if horizon is None else horizon
+        view = RoadView(width, height, float(np.clip(row, 0.0, 0.85 * height)))
+        return Prepared(image, self.canvas(image, view)[None], view)
+
+    def canvas(self, image: Image, view: RoadView) -> NDArray[np.uint8]:
+        """The canonical picture (size, size, 3) in RGB of a BGR image seen in `view`."""
+        scaling = Scaling(min(1.0, self.detail_width / view.width))
+        columns, rows = self.geometry.grid(view)
+        detail = resized(image, scaling)
+        canvas = cv2.remap(
+            detail,
+            scaling.to_working(0.0) + (columns * scaling.factor).astype(np.float32),
+            scaling.to_working(0.0) + (rows * scaling.factor).astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        return np.asarray(cv2.cvtColor(canvas, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
+        """The boundaries in the network's outputs (1, 15), left to right, and the horizon that it saw."""
+        reading = RoadReading.of(outputs[0])
+        view = reading.view(prepared.view)
+        detections = []
+        for side in (0, 1):
+            curve = reading.curve(side, view)
+            rows = visible_rows(curve, view, _TOP_SHARE)
+            if reading.presence[side] >= self.threshold and rows is not None:
+                covariance = reading.covariance(side, view)
+                detections.append(Detection(curve, covariance, *rows, float(reading.presence[side])))
+        return Findings(tuple(detections), view, float(reading.presence.max()))
+
+
+def _anchor_rows(view: RoadView) -> FloatArray:
+    return view.horizon + np.asarray(ANCHORS) * view.depth
+
+
+def _middle(view: RoadView) -> float:
+    return (view.width - 1) / 2.0
