@@ -9,8 +9,8 @@ import click
 
 from lanestream.engine import SHIPPED_MODEL, load_engine
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.evaluate import Evaluation
-from lanestream_exporter.score import score as measured
+from lanestream_exporter.evaluation.measuring import Evaluation
+from lanestream_exporter.evaluation.score import score as measured
 
 _DATA = click.option(
     "--data", type=click.Path(path_type=Path), help="Folder of real frames [default: $LANESTREAM_DATA]."

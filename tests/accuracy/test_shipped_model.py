@@ -8,7 +8,7 @@ import pytest
 
 from lanestream.engine import SHIPPED_MODEL, Engine, load_engine
 from lanestream_exporter.datasets.splits import highway_clip, real_frames
-from lanestream_exporter.evaluate import Evaluation
+from lanestream_exporter.evaluation.measuring import Evaluation
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from lanestream.detection.detector import CandidateDetector
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve
-from lanestream_exporter.boundaries import Found, Tally, count, ego_labels
+from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
 from lanestream_exporter.patches import TRUE, TruthRule
 from lanestream_exporter.scenes import Drive, RenderedFrame, render_still, sample_clip
 

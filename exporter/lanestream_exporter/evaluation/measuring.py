@@ -20,10 +20,10 @@ from lanestream.detection import Prepared
 from lanestream.engine import Engine
 from lanestream.errors import SourceError
 from lanestream.lanes import FrameResult, Image
-from lanestream_exporter.boundaries import Found, Tally, count, ego_labels
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import LabelledClip, Split, labelled_clips, real_frames
+from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
 from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, TruthRule, distance_along
 
 

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 from lanestream.errors import SourceError
 from lanestream.lanes import Curve
 from lanestream.protocol import LaneModel, LanesMessage
-from lanestream_exporter.boundaries import Found, Tally, count, ego_labels
 from lanestream_exporter.datasets.clips import read_clip_labels
+from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
 
 
 def score(results: Path, labels: Path) -> dict[str, Any]:
