@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from multiprocessing import get_context
@@ -28,21 +29,31 @@ _SIZES = ((640, 360), (640, 480), (960, 540), (1280, 720))
 _SHARES = (0.4, 0.2, 0.25, 0.15)
 
 
-def rendered_stores(folder: Path, files: int, workers: int, done: Callable[[Path], None]) -> list[Path]:
-    """`files` files of patches from `SCENES_PER_FILE` scenes each, numbered by seed; those already there are kept.
+def rendered_stores(folder: Path, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
+    """Files of patches, the n-th from `scenes[n]` scenes and seeded by n; those already there are kept.
 
-    `done` is called with each file as it is finished.
+    `done` is called with the number of scenes of each file as it is finished.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"rendered-{number:04d}.npz" for number in range(files)]
-    missing = [(number, path) for number, path in enumerate(paths) if not path.exists()]
+    paths = [folder / f"rendered-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
+    missing = [number for number, path in enumerate(paths) if not path.exists()]
+    done(sum(scenes) - sum(scenes[number] for number in missing))
     # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        running = {pool.submit(_render_file, number, path): path for number, path in missing}
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_leave_interrupts_to_the_parent)
+    try:
+        running = {pool.submit(_render_file, number, scenes[number], paths[number]): number for number in missing}
         for future in as_completed(running):
             future.result()
-            done(running[future])
+            done(scenes[running[future]])
+    finally:
+        pool.shutdown(cancel_futures=True)
     return paths
+
+
+def files_of(scenes: int) -> list[int]:
+    """How `scenes` scenes are shared out among files."""
+    full, rest = divmod(scenes, SCENES_PER_FILE)
+    return [SCENES_PER_FILE] * full + ([rest] if rest else [])
 
 
 def real_store(folder: Path, root: Path, split: Split) -> Path:
@@ -57,14 +68,18 @@ def real_store(folder: Path, root: Path, split: Split) -> Path:
     return path
 
 
-def _render_file(number: int, path: Path) -> None:
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _render_file(number: int, scenes: int, path: Path) -> None:
     cv2.setNumThreads(1)
-    write_store(path, _rendered_patches(number))
+    write_store(path, _rendered_patches(number, scenes))
 
 
-def _rendered_patches(number: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
+def _rendered_patches(number: int, scenes: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
     maker = PatchMaker()
-    for index in range(SCENES_PER_FILE):
+    for index in range(scenes):
         rng = np.random.default_rng([number, index])
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
         still = render_still(sample_scene(rng, width, height))

@@ -2,79 +2,112 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 import click
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from lanestream.inference.providers import cpu_threads
-from lanestream_exporter.alexnet import load_state
-from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.patchstore import PatchStore, read_stores
-from lanestream_exporter.rendering import real_store, rendered_stores
-from lanestream_exporter.train import ClassifierTraining, TrainData, TrainSettings
-from lanestream_exporter.train import Progress as TrainProgress
+from lanestream_exporter.training.classifier import ClassifierTask, starting_network
+from lanestream_exporter.training.config import SHIPPED, ClassifierConfig, TrainConfig, read_config
+from lanestream_exporter.training.device import best_device, described
+from lanestream_exporter.training.loop import Progress as Learnt
+from lanestream_exporter.training.loop import Run, Task
+from lanestream_exporter.training.sources import patch_sources
 
+_INTERRUPTED = 130
+
+_RUN = click.option(
+    "--run", "folder", type=click.Path(path_type=Path), required=True, help="Folder of the run; made where missing."
+)
 _DATA = click.option(
     "--data", type=click.Path(path_type=Path), help="Folder of real frames [default: $LANESTREAM_DATA]."
 )
-_CHECKED = 1000  # rendered patches that validation looks at
 
 
 @click.group()
 def train() -> None:
-    """Train a network."""
+    """Train a network. The same command again goes on where the run was."""
 
 
 @train.command()
-@click.argument("run", type=click.Path(path_type=Path))
-@click.option(
-    "--steps", type=click.IntRange(1), default=TrainSettings.steps, show_default=True, help="Batches to learn from."
-)
-@click.option(
-    "--batch", type=click.IntRange(8), default=TrainSettings.batch, show_default=True, help="Patches in a batch."
-)
-@click.option(
-    "--rendered", type=click.IntRange(1), default=20, show_default=True, help="Files of 250 rendered scenes each."
-)
-@click.option("--init", type=click.Path(path_type=Path), help="torchvision's AlexNet weights to start from.")
+@click.argument("config", type=click.Path(path_type=Path), default=Path("classifier"))
+@_RUN
 @_DATA
-def classifier(run: Path, steps: int, batch: int, rendered: int, init: Path | None, data: Path | None) -> None:
-    """Train the candidate classifier in the folder RUN; the same command again goes on where it was.
+@click.option("--patches", type=click.Path(path_type=Path), help="Folder that keeps the patches [default: in the run].")
+def classifier(config: Path, folder: Path, data: Path | None, patches: Path | None) -> None:
+    """Train the candidate classifier as CONFIG says: a TOML file, or the name of a shipped one.
 
-    Renders scenes, cuts patches of them and of the real frames' training split, and mixes the two.
+    Renders scenes, cuts patches of them and of real frames, and mixes the two.
     """
-    if init is not None:
-        load_state(init)  # what is no checkpoint is told now, not after the patches have been made
-    stores = _stores(run / "patches", data_root(data), rendered)
-    click.echo(f"{len(stores.rendered)} rendered and {len(stores.real)} real patches to train on")
-    training = ClassifierTraining(TrainSettings(steps=steps, batch=batch), stores, run, init)
-    with _progress() as bar:
-        task = bar.add_task("training", total=steps)
+    settings = read_config(config, ClassifierConfig)
+    network = starting_network(settings)  # what is no checkpoint is told now, not after the patches have been made
+    with _bar("rendering") as advance:
+        sources, origin = patch_sources(settings.data, patches or folder / "patches", data, advance)
+    for source in sources:
+        click.echo(f"{source.name}: {len(source.train)} patches to train on, {len(source.check)} to validate with")
+    _learn(ClassifierTask(settings, network, sources, origin), settings, folder)
 
-        def told(progress: TrainProgress) -> None:
-            bar.update(task, completed=progress.step, description=f"training, loss {progress.loss:.3f}")
-            if progress.real_check is not None:
+
+@train.command()
+@click.argument("name", type=click.Choice(sorted(path.stem for path in SHIPPED.glob("*.toml"))))
+def recipe(name: str) -> None:
+    """Print the shipped configuration NAME, to start one's own from."""
+    click.echo((SHIPPED / f"{name}.toml").read_text(encoding="utf-8"), nl=False)
+
+
+def _learn(task: Task, config: TrainConfig, folder: Path) -> None:
+    """Trains to the end or to an interruption, and tells how it goes."""
+    run = Run(task, config, folder)
+    click.echo(f"training on {described(best_device())}" + (f" from step {run.step} on" if run.step else ""))
+    with _interruptible() as stopped, _progress() as bar:
+        shown = bar.add_task("training", total=config.steps, completed=run.step)
+
+        def told(learnt: Learnt) -> None:
+            bar.update(shown, completed=learnt.step, description=f"training, loss {learnt.loss:.3f}")
+            if learnt.figures:
+                figures = ", ".join(f"{name.replace('_', ' ')} {value:.4f}" for name, value in learnt.figures.items())
                 bar.console.print(
-                    f"step {progress.step}: loss {progress.loss:.3f},"
-                    f" validation {progress.rendered_check:.3f} rendered, {progress.real_check:.3f} real"
+                    f"step {learnt.step}: loss {learnt.loss:.3f}, {figures}", highlight=False, soft_wrap=True
                 )
 
-        best = training.run(told)
-    click.echo(f"best checkpoint: {best}")
+        run.go(told, stopped)
+    if not run.finished:
+        click.echo(f"stopped after step {run.step}; the same command again goes on from there")
+        raise click.exceptions.Exit(_INTERRUPTED)
+    click.echo(f"best checkpoint: {run.best}")
 
 
-def _stores(folder: Path, root: Path, files: int) -> TrainData:
-    """All patches of a run, made where they are missing; the first rendered file is kept for validation."""
-    real, real_check = (read_stores([real_store(folder, root, split)]) for split in ("train", "val"))
+@contextmanager
+def _interruptible() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C in the block makes the yielded function true, so that a step is never cut in two; a second one ends it."""
+    asked = False
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _bar(name: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar that is told (how many more are done, how many there are)."""
     with _progress() as bar:
-        task = bar.add_task("rendering", total=files + 1)
-        paths = rendered_stores(folder, files + 1, cpu_threads(), lambda _: bar.advance(task))
-    held_out = read_stores(paths[:1])
-    check = PatchStore(held_out.data, held_out.offsets[: _CHECKED + 1], held_out.labels[:_CHECKED])
-    return TrainData(read_stores(paths[1:]), real, check, real_check)
+        task = bar.add_task(name, total=None)
+        yield lambda done, total: bar.update(task, advance=done, total=total)
 
 
 def _progress() -> Progress:
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    return Progress(*columns)
+    columns = BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    return Progress(TextColumn("{task.description}"), *columns)

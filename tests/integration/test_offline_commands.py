@@ -44,6 +44,8 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "binary").write_bytes(bytes(range(128, 256)))
     (tmp_path / "half.jsonl").write_text('{"frame": 0, "width": 640, "height": 360}\n')
     (tmp_path / "empty.jsonl").write_text("")
+    (tmp_path / "initial.toml").write_text('initial = "text"')
+    (tmp_path / "unknown.toml").write_text("[data]\nscenes = 3\n")
     (tmp_path / "none").mkdir()
     (tmp_path / "broken" / "tusimple").mkdir(parents=True)
     (tmp_path / "broken" / "tusimple" / "labels.jsonl").write_text('{"split": "train"}\n')
@@ -61,9 +63,12 @@ def folder(tmp_path: Path) -> Path:
         ("score empty.jsonl binary", "binary is not a text file"),
         ("score empty.jsonl half.jsonl", "half.jsonl:1: there is no 'lanes'"),
         ("evaluate --data none", "no labelled frames in none"),
-        ("train classifier run --data none", "no labelled frames in none"),
-        ("train classifier run --data broken", "labels.jsonl:1: there is no"),
-        ("train classifier run --data broken --init text", "text is not a PyTorch checkpoint"),
+        ("train classifier --run run --data none", "no labelled frames in none"),
+        ("train classifier --run run --data broken", "labels.jsonl:1: there is no"),
+        ("train classifier initial.toml --run run --data broken", "text is not a PyTorch checkpoint"),
+        ("train classifier missing.toml --run run", "can't read missing.toml"),
+        ("train classifier text --run run", "text is not a TOML file"),
+        ("train classifier unknown.toml --run run", "unknown.toml: there is no data.scenes (accepted here: rendered"),
         ("export missing.pt out.onnx --data broken", "no checkpoint at missing.pt"),
         ("export text out.onnx --data broken", "text is not a PyTorch checkpoint"),
     ],
@@ -76,7 +81,7 @@ def test_what_cannot_be_used_is_told_in_one_line(run: Run, arguments: str, words
     assert done.errors.count("\n") == 1
 
 
-@pytest.mark.parametrize("arguments", ["train classifier run --steps 0", "scene out.mp4 --seed -1"])
+@pytest.mark.parametrize("arguments", ["evaluate --split all", "scene out.mp4 --seed -1"])
 def test_numbers_out_of_range_are_refused(run: Run, arguments: str) -> None:
     done = run(arguments)
     assert done.code == 2

@@ -1,0 +1,172 @@
+"""The loop that networks learn in: seeded, resumable, refusing what does not fit; its configuration and its average."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lanestream.errors import CheckpointError, SettingsError
+from lanestream_exporter.training.average import WeightAverage
+from lanestream_exporter.training.checkpoints import read_checkpoint
+from lanestream_exporter.training.config import (
+    SHIPPED,
+    AdamW,
+    ClassifierConfig,
+    Cosine,
+    Sgd,
+    Staircase,
+    TrainConfig,
+    read_config,
+)
+from lanestream_exporter.training.loop import Batch, Progress, Run, rate_at
+
+
+class Parity:
+    """Tells whether two signs agree, by a small network with dropout and batch normalisation."""
+
+    def __init__(self) -> None:
+        torch.manual_seed(0)
+        self.network = nn.Sequential(nn.Linear(2, 16), nn.BatchNorm1d(16), nn.ReLU(), nn.Dropout(0.2), nn.Linear(16, 1))
+        self.data: dict[str, Any] = {"samples": 64}
+
+    def batch(self, step: int) -> Batch:
+        generator = torch.Generator().manual_seed(step)
+        x = torch.randn((64, 2), generator=generator)
+        return x, (x[:, :1] * x[:, 1:] > 0).float()
+
+    def loss(self, network: nn.Module, batch: Batch) -> Tensor:
+        return functional.binary_cross_entropy_with_logits(network(batch[0]).float(), batch[1])
+
+    def check(self, network: nn.Module) -> dict[str, float]:
+        return {"validation": self.loss(network, self.batch(1_000_000)).item()}
+
+
+CONFIG = TrainConfig(steps=60, check_every=20, ema=0.9, optimiser=AdamW(learning_rate=0.05), schedule=Cosine(warm_up=5))
+
+
+def trained(folder: Path, config: TrainConfig = CONFIG, stop_at: int | None = None) -> list[Progress]:
+    told: list[Progress] = []
+    Run(Parity(), config, folder).go(told.append, lambda: told[-1].step == stop_at)
+    return told
+
+
+def weights(path: Path) -> dict[str, Tensor]:
+    found: dict[str, Tensor] = read_checkpoint(path)["network"]
+    return found
+
+
+@pytest.mark.parametrize("stop_at", [7, 20, 59])
+def test_a_run_that_was_stopped_and_goes_on_is_the_same_run(tmp_path: Path, stop_at: int) -> None:
+    whole = trained(tmp_path / "whole")
+    first = trained(tmp_path / "parts", stop_at=stop_at)
+    second = trained(tmp_path / "parts")
+    assert [p.step for p in first + second] == list(range(1, 61))
+    assert first + second == whole
+    expected, got = (weights(tmp_path / name / "best.pt") for name in ("whole", "parts"))
+    assert expected.keys() == got.keys()
+    assert all(torch.equal(expected[key], got[key]) for key in expected)
+    assert (tmp_path / "whole" / "curve.csv").read_text() == (tmp_path / "parts" / "curve.csv").read_text()
+    assert (tmp_path / "parts" / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_it_learns_and_keeps_the_best_with_what_made_it(tmp_path: Path) -> None:
+    told = trained(tmp_path)
+    checks = [p.figures["validation"] for p in told if p.figures]
+    assert len(checks) == 3
+    assert min(checks) < 0.4 < checks[0] + 0.3
+    best = read_checkpoint(tmp_path / "best.pt")
+    assert best["figures"]["validation"] == min(checks)
+    assert best["record"]["config"] == CONFIG.recorded
+    assert best["record"]["data"] == {"samples": 64}
+    assert best["record"]["torch"] == torch.__version__
+
+
+def test_a_finished_run_does_nothing_more(tmp_path: Path) -> None:
+    trained(tmp_path)
+    before = (tmp_path / "best.pt").read_bytes()
+    assert trained(tmp_path) == []
+    assert (tmp_path / "best.pt").read_bytes() == before
+
+
+def test_a_run_of_another_configuration_or_other_data_is_refused(tmp_path: Path) -> None:
+    trained(tmp_path, stop_at=5)
+    with pytest.raises(SettingsError, match="another config: seed was 1"):
+        trained(tmp_path, CONFIG.model_copy(update={"seed": 2}))
+    task = Parity()
+    task.data["samples"] = 65
+    with pytest.raises(SettingsError, match="another data: samples was 64"):
+        Run(task, CONFIG, tmp_path)
+
+
+def test_a_broken_checkpoint_is_named(tmp_path: Path) -> None:
+    (tmp_path / "last.pt").write_text("half a file")
+    with pytest.raises(CheckpointError, match=r"last\.pt"):
+        Run(Parity(), CONFIG, tmp_path)
+
+
+def test_a_run_that_blows_up_says_so(tmp_path: Path) -> None:
+    config = TrainConfig(steps=50, optimiser=Sgd(kind="sgd", learning_rate=1e30))
+    with pytest.raises(SettingsError, match="lower the learning rate"):
+        trained(tmp_path, config)
+
+
+def test_the_average_follows_the_weights_and_forgets_the_first_ones() -> None:
+    network = nn.BatchNorm1d(1)
+    average = WeightAverage(network, 0.9)
+    values = []
+    for step in range(200):
+        with torch.no_grad():
+            network.weight.fill_(5.0 if step < 100 else 7.0)
+            assert network.running_mean is not None
+            network.running_mean.fill_(3.0)
+        average.update(network)
+        values.append(average.network.state_dict()["weight"].item())
+    assert values[9] == pytest.approx(5.0, abs=0.05)  # it began at 1
+    assert values[109] == pytest.approx(7.0 - 2.0 * 0.9**10, abs=0.01)
+    assert average.network.state_dict()["running_mean"].item() == pytest.approx(3.0, abs=1e-3)
+    assert not any(parameter.requires_grad for parameter in average.network.parameters())
+
+
+def test_schedules() -> None:
+    cosine = TrainConfig(steps=1000, schedule=Cosine(warm_up=100))
+    assert rate_at(cosine, 49) == pytest.approx(1.5e-4, rel=0.01)
+    assert rate_at(cosine, 500) == pytest.approx(1.5e-4)
+    assert rate_at(cosine, 999) < 1e-8
+    stairs = TrainConfig(optimiser=Sgd(kind="sgd"), schedule=Staircase(kind="staircase", every=10))
+    assert [rate_at(stairs, step) for step in (9, 10, 20)] == pytest.approx([1e-3, 1e-4, 1e-5])
+
+
+def test_the_shipped_configurations_are_read() -> None:
+    assert read_config(Path("classifier"), ClassifierConfig) == ClassifierConfig()
+    published = read_config(SHIPPED / "classifier-published.toml", ClassifierConfig)
+    assert published.optimiser == Sgd(kind="sgd", learning_rate=0.001, momentum=0.9, weight_decay=1e-4)
+    assert published.batch == 15
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("stepps = 3", "there is no stepps (accepted here: seed, steps, batch"),
+        ("steps = 0", "steps = 0 is not accepted (Input should be greater than 0)"),
+        ('[optimiser]\nkind = "adamw"\nmomentum = 0.9', "no optimiser.momentum (accepted here: kind, learning_rate, w"),
+        ('[optimiser]\nkind = "lion"', "optimiser = {'kind': 'lion'} is not accepted"),
+        ("[optimiser]\nlearning_rate = 3e-4", "optimiser = {'learning_rate': 0.0003} is not accepted"),
+        ("[data]\nrendered_scenes = 0", "data: without rendered scenes real_share and final_real_share must be 1"),
+        ("data = 3", "data = 3 is not accepted"),
+        ("steps", "is not a TOML file"),
+    ],
+)
+def test_a_bad_configuration_costs_one_line(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(SettingsError) as raised:
+        read_config(path, ClassifierConfig)
+    message = str(raised.value)
+    assert message.startswith(str(path))
+    assert words in message
+    assert "\n" not in message
