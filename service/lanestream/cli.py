@@ -34,6 +34,7 @@ class Mount:
 
 
 _CLIENT: Final = "lanestream_client.commands"
+_DATA: Final = "lanestream_exporter.data_commands"
 _SCENES: Final = "lanestream_exporter.scene_commands"
 _TRAINING: Final = "lanestream_exporter.training_commands"
 _EXPORT: Final = "lanestream_exporter.export_commands"
@@ -42,6 +43,7 @@ _MOUNTS: Final[Mapping[str, Mount]] = {
     "detect": Mount(_CLIENT, "detect", "video", "Find lanes in images."),
     "stream": Mount(_CLIENT, "stream", "video", "Follow the lanes of one camera."),
     "scene": Mount(_SCENES, "scene", "video", "Render a clip of a road, with exact labels."),
+    "data": Mount(_DATA, "data", "export", "Look after labelled frames."),
     "train": Mount(_TRAINING, "train", "train,service,cpu", "Train a network."),
     "export": Mount(_EXPORT, "export", "export,service,cpu", "Turn a checkpoint into a model file."),
     "evaluate": Mount(_EVALUATION, "evaluate", "export,service,cpu", "Measure a model's accuracy."),

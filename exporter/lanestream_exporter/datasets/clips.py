@@ -11,8 +11,14 @@ import numpy as np
 
 from lanestream.errors import LabelError, SourceError
 from lanestream.lanes import Image
+from lanestream_exporter.datasets.entries import Entries, Entry, numbered
+from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
-from lanestream_exporter.datasets.records import records, unusable
+from lanestream_exporter.datasets.pictures import Picture
+from lanestream_exporter.datasets.polylines import points_of
+from lanestream_exporter.datasets.records import all_records, placed, records, unusable
+
+_NEEDED = "frame, width, height and lanes"
 
 
 def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, LabelledFrame]:
@@ -25,24 +31,24 @@ def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, Labelled
         try:
             frames[int(record["frame"])] = _frame(record, path, exhaustive)
         except (ValueError, KeyError, TypeError) as error:
-            raise unusable(place, error, "frame, width, height and lanes") from error
+            raise unusable(place, error, _NEEDED) from error
     return frames
 
 
 def _frame(record: dict[str, Any], path: Path, exhaustive: bool) -> LabelledFrame:
-    lanes = tuple(
-        LabelledLane(
-            points=np.asarray(lane["points"], dtype=float).reshape(-1, 2),
-            lane_id=lane.get("id"),
-            position=lane.get("position"),
-            kind=lane.get("type"),
-            color=lane.get("color"),
-        )
-        for lane in record["lanes"]
-    )
+    lanes = tuple(_lanes(record))
     clip = str(record.get("clip", path.stem))
     source = f"{clip}#{record['frame']}"
     return LabelledFrame(int(record["width"]), int(record["height"]), lanes, Path(clip).stem, source, exhaustive)
+
+
+def _lanes(record: dict[str, Any]) -> Iterator[LabelledLane]:
+    for number, lane in enumerate(record["lanes"], start=1):
+        try:
+            points = points_of(lane["points"])
+        except ValueError as error:
+            raise ValueError(f"lane {number}: {error}") from None
+        yield LabelledLane(points, lane.get("id"), lane.get("position"), lane.get("type"), lane.get("color"))
 
 
 def read_clip(video: Path, labels: Path) -> Iterator[tuple[LabelledFrame, Image]]:
@@ -59,3 +65,40 @@ def read_clip(video: Path, labels: Path) -> Iterator[tuple[LabelledFrame, Image]
                 yield wanted[index], np.asarray(capture.retrieve()[1], dtype=np.uint8)
     finally:
         capture.release()
+
+
+def clip_entries(folder: DataFolder) -> Entries:
+    """The frames of all files of clip labels, from their `image` where one is named, else from the clip.
+
+    A clip is looked for beside its labels and in the folders `clips` and `videos`; each is a group.
+    """
+    for path in folder.with_suffix(".jsonl"):
+        found: list[Entry] = []
+        for place, record in all_records(path):
+            if isinstance(record, LabelError):
+                yield record
+                continue
+            try:
+                found.append(_entry(record, place, path, folder))
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                yield unusable(place, error, _NEEDED)
+            except LabelError as error:
+                yield placed(place, error)
+        # In order, because a video is decoded from its start.
+        yield from sorted(found, key=lambda entry: entry.picture.index or 0)
+
+
+def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -> Entry:
+    size = int(record["width"]), int(record["height"])
+    lanes = numbered(_lanes(record))
+    clip = relative(record.get("clip") or f"{path.stem}.mp4")
+    if "image" in record:
+        image = folder.find(path.parent / relative(record["image"]))
+        group = clip.stem if "clip" in record else drive_of(image.parent)
+        return Entry(place, folder.name(image), group, Picture(image), lanes, size)
+    index = int(record["frame"])
+    if index < 0:
+        raise ValueError(f"frame {index} is before the first one")
+    root = folder.root
+    video = folder.find(path.parent / clip, root / "clips" / clip, root / "videos" / clip, root / clip)
+    return Entry(place, f"{video.name}#{index}", clip.stem, Picture(video, index), lanes, size)

@@ -7,25 +7,60 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lanestream.errors import LabelError
+from lanestream.errors import LabelError, LanestreamError
+
+_ACCEPTED = "one JSON object a line is accepted"
 
 
 def records(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """(place, object) for each line of `path`, the place as `file:line`. Raises LabelError that names the place."""
+    for place, record in all_records(path):
+        if isinstance(record, LabelError):
+            raise record
+        yield place, record
+
+
+def all_records(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelError]]:
+    """As `records`, but a bad line is yielded as its error, and those after it still come. Raises nothing."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = text_of(path).splitlines()
+    except LabelError as error:
+        yield str(path), error
+        return
+    for number, line in enumerate(lines, start=1):
+        place = f"{path}:{number}"
+        try:
+            yield place, json_object(line, place, _ACCEPTED)
+        except LabelError as error:
+            yield place, error
+
+
+def text_of(path: Path, accepted: str = _ACCEPTED) -> str:
+    """What the text file `path` says. Raises LabelError where it can't be read or is no text."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise LabelError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
     except UnicodeDecodeError:
-        raise LabelError(f"{path} is not a text file", "one JSON object a line is accepted") from None
-    for number, line in enumerate(lines, start=1):
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise LabelError(f"{path}:{number}: not JSON: {error.msg}", "one JSON object a line is accepted") from None
-        if not isinstance(record, dict):
-            raise LabelError(f"{path}:{number}: not a JSON object", "one JSON object a line is accepted")
-        yield f"{path}:{number}", record
+        raise LabelError(f"{path} is not a text file", accepted) from None
+
+
+def json_object(text: str, place: str, accepted: str) -> dict[str, Any]:
+    """The JSON object that `text` is. Raises LabelError that names the `place` and what is `accepted` there."""
+    try:
+        found = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise LabelError(f"{place}: not JSON: {error.msg}", accepted) from None
+    except (RecursionError, ValueError):
+        raise LabelError(f"{place}: not JSON that can be read: too deep, or a number too long", accepted) from None
+    if not isinstance(found, dict):
+        raise LabelError(f"{place}: not a JSON object", accepted)
+    return found
+
+
+def placed(place: str, error: LanestreamError) -> LabelError:
+    """`error` as the error of the record at `place`."""
+    return LabelError(f"{place}: {error.message}", error.hint)
 
 
 def unusable(place: str, error: Exception, needed: str) -> LabelError:

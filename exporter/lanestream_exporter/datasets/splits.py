@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
@@ -52,12 +54,16 @@ def real_frames(root: Path, split: Split) -> Iterator[tuple[LabelledFrame, Image
 
 @dataclass(frozen=True)
 class LabelledClip:
-    """A video with key-frame labels, and the stretch of its frames that belongs to a split."""
+    """A video with key-frame labels, and the stretch of its frames that belongs to a split.
+
+    `exhaustive` says that the labels name every boundary that can be told.
+    """
 
     name: str
     video: Path
     labels: Path
     frames: range
+    exhaustive: bool = False
 
 
 def highway_clip(root: Path, name: str) -> LabelledClip:
@@ -72,7 +78,7 @@ def labelled_clips(root: Path, split: Split) -> list[LabelledClip]:
     video, labels = country / "country_road_140s.mp4", country / "labels.jsonl"
     return [
         *(highway_clip(root, name) for name in _CLIPS[split]),
-        LabelledClip("country_road", video, labels, _COUNTRY_FRAMES[split]),
+        LabelledClip("country_road", video, labels, _COUNTRY_FRAMES[split], exhaustive=True),
     ]
 
 
@@ -86,3 +92,55 @@ def _country_frames(root: Path, wanted: range) -> Iterator[tuple[LabelledFrame, 
             if image is None:
                 raise LabelError(f"{labels}: {images[index]} can't be read as an image")
             yield frame, np.asarray(image, dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class GroupSplit:
+    """Which drives or clips are trained on, and which choose and calibrate."""
+
+    train: frozenset[str]
+    validation: frozenset[str]
+
+
+def split_by_group(groups: Iterable[str], validation_share: float, seed: int = 0) -> GroupSplit:
+    """Divides frames by drive or clip; `groups` has the `frame.group` of every frame, in any order.
+
+    Whole groups in an order drawn with `seed` go to validation while that brings its frames nearer to
+    `validation_share` (0 to 1) of all; each side has a group at least. The same frames and seed give the same split.
+    Raises LabelError where there are fewer than two groups, because one can't be divided.
+    """
+    sizes = Counter(groups)
+    if len(sizes) < 2:
+        raise LabelError(
+            f"there is no split of {len(sizes)} drive or clip by drive",
+            "frames of two at least are needed: put each into a folder of its own",
+        )
+    wanted = validation_share * sizes.total()
+    names = sorted(sizes)
+    order = [names[number] for number in np.random.default_rng(seed).permutation(len(names))]
+    validation: set[str] = set()
+    taken = 0
+    for name in order:
+        if abs(taken + sizes[name] - wanted) < abs(taken - wanted):
+            validation.add(name)
+            taken += sizes[name]
+    if not validation:
+        validation.add(min(order, key=lambda name: sizes[name]))
+    if len(validation) == len(names):
+        validation.remove(max(order, key=lambda name: sizes[name]))
+    return GroupSplit(frozenset(names) - validation, frozenset(validation))
+
+
+def refuse_leak(train: Iterable[str], validation: Iterable[str], test: Iterable[str] = ()) -> None:
+    """Raises LabelError where a drive or clip is in more than one part; each part is the `frame.group` of its frames.
+
+    Neighbouring frames look alike, so that a drive on both sides would be a test on what was learnt by heart.
+    """
+    parts = {"train": set(train), "validation": set(validation), "test": set(test)}
+    for (one, left), (other, right) in combinations(parts.items(), 2):
+        if shared := sorted(left & right):
+            more = f" and {len(shared) - 1} more" if len(shared) > 1 else ""
+            raise LabelError(
+                f"{shared[0]!r}{more} is in both {one} and {other}",
+                "a drive or clip may be on one side of a split only",
+            )

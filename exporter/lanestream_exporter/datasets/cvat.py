@@ -1,0 +1,173 @@
+"""CVAT's labels, "CVAT for images 1.1" and "CVAT for video 1.1": of what an XML file holds, polylines are boundaries.
+
+Attributes `type` (or `kind`), `color` (or `colour`), `position` and `id` of a polyline tell what they say; the words
+of its label stand in for the first two. A track's id is the boundary's id. Coordinates are taken as written.
+Format: docs.cvat.ai/docs/dataset_management/formats/format-cvat and docs.cvat.ai/docs/other/xml_format.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from xml.etree.ElementTree import Element, ParseError
+
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import parse
+
+from lanestream.errors import LabelError
+from lanestream_exporter.datasets.entries import Entries, Entry, colour_in, kind_in, numbered
+from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
+from lanestream_exporter.datasets.labels import LabelledLane
+from lanestream_exporter.datasets.pictures import Picture
+from lanestream_exporter.datasets.polylines import points_of
+from lanestream_exporter.datasets.records import placed, unusable
+
+_SHAPES: Final = frozenset({"box", "polygon", "points", "cuboid", "skeleton", "ellipse", "mask"})
+_POSITION: Final = re.compile(r"[+-]?[1-9]")
+_ACCEPTED: Final = "an XML file of CVAT, for images or for video, is accepted"
+
+
+def cvat_entries(folder: DataFolder) -> Entries:
+    """The frames of all XML files.
+
+    A group is the folder of the images where an image's name has one, else the name of the task; or the video.
+    """
+    for path in folder.with_suffix(".xml"):
+        try:
+            root = _root(path)
+        except LabelError as error:
+            yield error
+            continue
+        for image in root.iterfind("image"):
+            place = f"{path}: image {image.get('name')}"
+            try:
+                yield _image_entry(image, place, _Export(path, root, folder))
+            except (ValueError, KeyError, TypeError) as error:
+                yield unusable(place, error, "name, width and height, and a polyline points")
+            except LabelError as error:
+                yield placed(place, error)
+        yield from _track_entries(_Export(path, root, folder))
+
+
+@dataclass(frozen=True)
+class _Export:
+    """One XML file in its folder."""
+
+    path: Path
+    root: Element
+    folder: DataFolder
+
+    def text(self, *places: str) -> str:
+        """What the first of the elements at `places` that is there says."""
+        found = (self.root.findtext(place) for place in places)
+        return next((text.strip() for text in found if text), "")
+
+
+def _root(path: Path) -> Element:
+    try:
+        root = parse(path, forbid_dtd=True).getroot()
+    except OSError as error:
+        raise LabelError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
+    except ParseError as error:
+        raise LabelError(f"{path}:{error.position[0]}: not XML: {error}", _ACCEPTED) from None
+    except (DefusedXmlException, ValueError):
+        raise LabelError(f"{path} declares entities or a document type", f"{_ACCEPTED}; it has none") from None
+    if root is None or root.tag != "annotations":
+        raise LabelError(f"{path} is XML, but not of CVAT: its root is no <annotations>", _ACCEPTED)
+    return root
+
+
+def _image_entry(image: Element, place: str, export: _Export) -> Entry:
+    name, base = relative(image.attrib["name"]), export.path.parent
+    subset = relative(image.get("subset") or ".")
+    found = export.folder.find(base / "images" / name, base / name, base / "images" / subset / name)
+    lanes: list[LabelledLane] = []
+    others: list[str] = []
+    for shape in image:
+        if shape.tag == "polyline":
+            number = len(lanes) + 1
+            lanes.append(_lane(shape, f"polyline {number}", shape.get("label", ""), None))
+        elif shape.tag in _SHAPES:
+            others.append(shape.tag)
+    task = export.text(f"meta/project/tasks/task[id='{int(image.get('task_id', 0))}']/name", "meta/task/name")
+    group = drive_of(found.parent) if len(name.parts) > 1 or not task else f"task {task}"
+    size = int(image.attrib["width"]), int(image.attrib["height"])
+    source = export.folder.name(found)
+    return Entry(place, source, group, Picture(found), numbered(lanes, "polyline"), size, others=tuple(others))
+
+
+def _lane(shape: Element, where: str, label: str, lane_id: int | None) -> LabelledLane:
+    try:
+        points = points_of([[float(n) for n in pair.split(",")] for pair in shape.attrib["points"].split(";") if pair])
+    except ValueError:
+        raise ValueError(f"{where}: its points are not pairs of numbers") from None
+    told = {str(a.get("name")).lower(): (a.text or "").strip().lower() for a in shape.iterfind("attribute")}
+    words = re.findall(r"[a-z]+", label.lower())
+    kind = kind_in([told.get("type", ""), told.get("kind", ""), *words])
+    colour = colour_in([told.get("color", ""), told.get("colour", ""), *words])
+    position = told.get("position", "")
+    if lane_id is None and told.get("id", "").isdecimal():
+        lane_id = int(told["id"])
+    return LabelledLane(points, lane_id, int(position) if _POSITION.fullmatch(position) else None, kind, colour)
+
+
+def _track_entries(export: _Export) -> Entries:
+    """The frames in which a track has a polyline that is in view."""
+    frames: dict[int, dict[str, LabelledLane]] = {}
+    for track in export.root.iterfind("track"):
+        where = f"track {track.get('id')}"
+        for shape in track.iterfind("polyline"):
+            if shape.get("outside") == "1":
+                continue
+            try:
+                lane = _lane(shape, where, track.get("label", ""), int(track.attrib["id"]))
+                frames.setdefault(int(shape.attrib["frame"]), {})[where] = lane
+            except (ValueError, KeyError) as error:
+                yield unusable(f"{export.path}: {where}", error, "an id, and polylines with frame and points")
+    if not frames:
+        return
+    try:
+        pictures = _Pictures.of(export)
+    except LabelError as error:
+        yield placed(str(export.path), error)
+        return
+    for index in sorted(frames):
+        place = f"{export.path}: frame {index}"
+        try:
+            yield pictures.entry(index, place, frames[index])
+        except LabelError as error:
+            yield placed(place, error)
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Where the frames of a video task are: in the video, or as images that were exported beside the labels."""
+
+    export: _Export
+    video: Path | None
+    group: str
+    size: tuple[int, int] | None
+
+    @classmethod
+    def of(cls, export: _Export) -> _Pictures:
+        name = export.text("meta/task/source", "meta/source") or export.text("meta/task/name") or export.path.stem
+        source, folder, base = relative(name), export.folder, export.path.parent
+        size = [
+            export.text(f"meta/task/original_size/{side}", f"meta/original_size/{side}") for side in ("width", "height")
+        ]
+        video = None
+        if not (base / "images").is_dir():
+            video = folder.find(base / source, folder.root / source, folder.root / "clips" / source)
+        known = (int(size[0]), int(size[1])) if size[0].isdecimal() and size[1].isdecimal() else None
+        return cls(export, video, source.stem, known)
+
+    def entry(self, index: int, place: str, lanes: dict[str, LabelledLane]) -> Entry:
+        """The entry of a frame. Raises LabelError where its image is missing."""
+        if self.video is not None:
+            source, picture = f"{self.video.name}#{index}", Picture(self.video, index)
+        else:
+            image = self.export.folder.picture_of(self.export.path.parent / "images" / f"frame_{index:06d}")
+            source, picture = self.export.folder.name(image), Picture(image)
+        return Entry(place, source, self.group, picture, lanes, self.size)
