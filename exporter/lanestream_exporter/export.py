@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from lanestream.errors import ExportError
 from lanestream.geometry import StripGeometry
-from lanestream.inference import ModelInfo, OnnxModel, StripInfo
+from lanestream.inference import ClassifierInfo, OnnxModel, StripInfo
 from lanestream.inference.model_info import METADATA_KEY
 from lanestream_exporter.alexnet import INPUT_SIZE, AlexNet, normalise
 from lanestream_exporter.calibration import Calibration, calibrated
@@ -130,7 +130,7 @@ def _to_onnx(served: ServedNetwork, path: Path) -> None:
 
 def _describe(path: Path, settings: ExportSettings, calibration: Calibration, record: dict[str, Any]) -> None:
     strip = StripGeometry()
-    info = ModelInfo(
+    info = ClassifierInfo(
         kind="classifier",
         name=settings.name,
         version=version("lanestream"),

@@ -6,11 +6,12 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from lanestream.detection import Network
+from lanestream.detection import LaneDetector, Network
 from lanestream.detection.detector import CandidateDetector
+from lanestream.detection.regression import RegressionDetector
 from lanestream.detection.strips import StripCutter
-from lanestream.geometry import StripGeometry
-from lanestream.inference import OnnxModel
+from lanestream.geometry import CanvasGeometry, StripGeometry
+from lanestream.inference import ModelInfo, OnnxModel, RegressorInfo
 from lanestream.inference.providers import Provider
 from lanestream.lanes import FrameResult, Image
 from lanestream.sessions import Session
@@ -22,7 +23,7 @@ SHIPPED_MODEL = Path(__file__).parent / "models" / "classifier.onnx"
 class Engine:
     """A loaded network and its detector, shared by all sessions of a process."""
 
-    def __init__(self, detector: CandidateDetector, network: Network) -> None:
+    def __init__(self, detector: LaneDetector, network: Network) -> None:
         self.detector = detector
         self.network = network
 
@@ -54,6 +55,14 @@ def load_engine(model: Path | None = None, provider: Provider = "auto") -> Engin
     """
     network = OnnxModel.load(model or SHIPPED_MODEL, provider)
     network.warm_up()
-    strip = network.info.strip
-    geometry = StripGeometry(strip.size, strip.half_width, strip.min_half_width)
-    return Engine(CandidateDetector(network.info.threshold, cutter=StripCutter(geometry)), network)
+    return Engine(_detector(network.info), network)
+
+
+def _detector(info: ModelInfo) -> LaneDetector:
+    """The detector that asks a network the questions it was trained for."""
+    if isinstance(info, RegressorInfo):
+        canvas = info.canvas
+        geometry = CanvasGeometry(canvas.size, canvas.above, canvas.narrowest)
+        return RegressionDetector(info.threshold, geometry, canvas.detail_width)
+    strip = StripGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width)
+    return CandidateDetector(info.threshold, cutter=StripCutter(strip))

@@ -10,7 +10,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from lanestream.errors import ModelError, ProviderError
-from lanestream.inference.model_info import ModelInfo
+from lanestream.inference.model_info import ModelInfo, parse_info
 from lanestream.inference.providers import Provider, choose, cpu_threads, verify
 
 # Batches are padded to one of these, so that a provider meets few shapes and all of them before the first frame.
@@ -56,7 +56,7 @@ class OnnxModel:
             raise ModelError(
                 f"{path} is not a model that can be run: {_line(error)}", "give an exported .onnx file"
             ) from error
-        info = ModelInfo.parse(session.get_modelmeta().custom_metadata_map, str(path))
+        info = parse_info(session.get_modelmeta().custom_metadata_map, str(path))
         return cls(session, info, verify(provider, session.get_providers()), choice.reason)
 
     @property
@@ -71,14 +71,14 @@ class OnnxModel:
 
     def warm_up(self) -> None:
         """Runs every batch size once, so that the first frame waits for nothing."""
-        size = self.info.strip.size
+        size = self.info.input_size
         for batch in BUCKETS:
             self.run(np.zeros((batch, size, size, 3), np.uint8))
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Probabilities (N, classes) of RGB patches (N, size, size, 3); any N, also 0 and beyond the largest bucket."""
+        """Outputs (N, outputs) for RGB inputs (N, size, size, 3); any N, also 0 and beyond the largest bucket."""
         parts = [self._padded(inputs[i : i + BUCKETS[-1]]) for i in range(0, len(inputs), BUCKETS[-1])]
-        return np.concatenate(parts) if parts else np.zeros((0, len(self.info.classes)), np.float32)
+        return np.concatenate(parts) if parts else np.zeros((0, self.info.outputs), np.float32)
 
     def _padded(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         bucket = next(size for size in BUCKETS if size >= len(inputs))
