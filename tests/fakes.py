@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Prepared
+from lanestream.detection import Findings, Prepared
 from lanestream.engine import Engine
 from lanestream.geometry import RoadView, visible_rows
 from lanestream.lanes import Curve, Detection, Image
@@ -26,7 +26,7 @@ class FakeDetector:
         view = RoadView(width, height, 0.4 * height if horizon is None else horizon)
         return Prepared(image, np.zeros((2, 8, 8, 3), np.uint8), view, (), 1.0)
 
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> list[Detection]:
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
         if prepared.image.min() == 255:
             raise RuntimeError("a detector's own mistake")
         found = []
@@ -35,7 +35,7 @@ class FakeDetector:
             rows = visible_rows(curve, prepared.view, 0.1)
             assert rows is not None
             found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9))
-        return found
+        return Findings(tuple(found), prepared.view, prepared.horizon_weight)
 
 
 class FakeNetwork:
