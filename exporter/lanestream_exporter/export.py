@@ -26,7 +26,8 @@ from lanestream_exporter.calibration import Calibration, calibrated
 from lanestream_exporter.compression import truncated
 from lanestream_exporter.patchstore import PatchStore
 from lanestream_exporter.quantize import quantized
-from lanestream_exporter.training import read_checkpoint, scores
+from lanestream_exporter.training.checkpoints import read_checkpoint
+from lanestream_exporter.training.scores import scores
 
 Precision = Literal["fp32", "int8"]
 

@@ -10,7 +10,7 @@ from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.export import ExportReport, ExportSettings, export_classifier
 from lanestream_exporter.patchstore import read_stores
 from lanestream_exporter.rendering import real_store
-from lanestream_exporter.training import read_checkpoint
+from lanestream_exporter.training.checkpoints import read_checkpoint
 
 _DATA = click.option(
     "--data", type=click.Path(path_type=Path), help="Folder of real frames [default: $LANESTREAM_DATA]."

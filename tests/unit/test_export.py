@@ -19,7 +19,7 @@ from lanestream_exporter.calibration import calibrated
 from lanestream_exporter.compression import truncated
 from lanestream_exporter.export import ExportSettings, export_classifier
 from lanestream_exporter.patchstore import PatchStore, read_stores, write_store
-from lanestream_exporter.training import read_checkpoint
+from lanestream_exporter.training.checkpoints import read_checkpoint
 
 
 @pytest.fixture(scope="module")

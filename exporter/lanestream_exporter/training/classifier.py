@@ -18,8 +18,8 @@ from lanestream_exporter.alexnet import AlexNet, initialise, load_state, normali
 from lanestream_exporter.augment import augmented
 from lanestream_exporter.patchstore import PatchStore
 from lanestream_exporter.training.config import ClassifierConfig
-from lanestream_exporter.training.device import autocast
 from lanestream_exporter.training.loop import CHOOSES, Batch
+from lanestream_exporter.training.scores import scores
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,8 @@ class ClassifierTask:
         real = round(config.batch * share)
         wanted = [("real", real), ("rendered", config.batch - real)]
         drawn = [draw(self._sources[name], count, rng) for name, count in wanted if count]
-        patches = torch.from_numpy(np.concatenate([patches for patches, _ in drawn]))
-        labels = torch.from_numpy(np.concatenate([labels for _, labels in drawn]))
-        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
-        return augmented(patches, generator), labels
+        patches, labels = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        return torch.from_numpy(augmented(patches, labels, config.augmentation, rng)), torch.from_numpy(labels)
 
     def loss(self, network: nn.Module, batch: Batch) -> Tensor:
         """The cross entropy, with smoothed labels."""
@@ -124,20 +122,6 @@ def draw(source: PatchSource, count: int, rng: np.random.Generator) -> tuple[NDA
     ]
     index = np.concatenate(chosen)
     return np.stack([store.patch(int(i)) for i in index]), store.labels[index]
-
-
-@torch.inference_mode()
-def scores(network: nn.Module, store: PatchStore, batch: int = 64) -> NDArray[np.float32]:
-    """Logits (N, classes) of all patches of a store."""
-    network.eval()
-    device = next(network.parameters()).device
-    parts = []
-    for start in range(0, len(store), batch):
-        patches = np.stack([store.patch(i) for i in range(start, min(start + batch, len(store)))])
-        with autocast(device):
-            logits = network(normalise(torch.from_numpy(patches).to(device)))
-        parts.append(logits.float().cpu().numpy())
-    return np.concatenate(parts)
 
 
 def _measured(network: nn.Module, store: PatchStore) -> tuple[float, float]:

@@ -58,7 +58,8 @@ class Staircase(Section):
 class TrainConfig(Section):
     """What every network's run has: how many steps of how many samples, how it learns, what it starts from.
 
-    `ema` is the decay per step of the moving average of the weights, 0 for none. `initial` is the file of weights to
+    `ema` is the decay per step of the moving average of the weights, 0 for none; `clip` is the largest norm that a
+    gradient keeps, 0 for any. `initial` is the file of weights to
     start from; its path counts from the folder in which the command runs, as all paths of the file do.
     """
 
@@ -67,6 +68,7 @@ class TrainConfig(Section):
     batch: Annotated[int, Field(ge=2)] = 96
     check_every: PositiveInt = 150
     ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    clip: Annotated[float, Field(ge=0.0)] = 0.0
     initial: str | None = None
     optimiser: Annotated[AdamW | Sgd, Field(discriminator="kind")] = AdamW()
     schedule: Annotated[Cosine | Staircase, Field(discriminator="kind")] = Cosine()
@@ -107,11 +109,38 @@ class PatchData(Section):
         return max(self.real_share, self.final_real_share) > 0.0
 
 
+class Light(Section):
+    """How often what happens to a picture's light and in the camera: shares of the pictures."""
+
+    exposure: Share = 1.0
+    shadow: Share = 0.33
+    glare: Share = 0.08
+    night: Share = 0.08
+    rain: Share = 0.08
+    blur: Share = 1.0
+    grain: Share = 1.0
+    lost: Share = 0.05
+    jpeg: Share = 0.15
+
+
+class Augmentation(Section):
+    """What patches are varied by. `flip` is a share of all and `shear` one of the false patches.
+
+    `jitter` is how far the top and the bottom of a patch move sideways at most, in pixels of the patch.
+    """
+
+    flip: Share = 0.5
+    jitter: Annotated[float, Field(ge=0.0, le=10.0)] = 3.0
+    shear: Share = 0.1
+    light: Light = Light()
+
+
 class ClassifierConfig(TrainConfig):
     """The classifier's run."""
 
     label_smoothing: Share = 0.05
     data: PatchData = PatchData()
+    augmentation: Augmentation = Augmentation()
 
 
 C = TypeVar("C", bound=TrainConfig)

@@ -137,6 +137,8 @@ class Run:
             loss = self._task.loss(self._network, tuple(part.to(self._device) for part in batch))
         self._optimiser.zero_grad()
         torch.autograd.backward(loss)
+        if self._config.clip:
+            nn.utils.clip_grad_norm_(self._network.parameters(), self._config.clip)
         self._optimiser.step()
         if self._average is not None:
             self._average.update(self._network)
@@ -206,9 +208,15 @@ def _optimiser(config: TrainConfig, network: nn.Module) -> torch.optim.Optimizer
     settings = config.optimiser
     if isinstance(settings, Sgd):
         return torch.optim.SGD(
-            network.parameters(), settings.learning_rate, settings.momentum, weight_decay=settings.weight_decay
+            network.parameters(),
+            settings.learning_rate,
+            settings.momentum,
+            weight_decay=settings.weight_decay,
+            fused=True,
         )
-    return torch.optim.AdamW(network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
+    return torch.optim.AdamW(
+        network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
+    )
 
 
 def _on_cpu(network: nn.Module) -> dict[str, Tensor]:
