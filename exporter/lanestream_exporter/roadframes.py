@@ -21,8 +21,6 @@ from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 from lanestream_exporter.datasets.splits import Split, real_frames
 from lanestream_exporter.scenes import render_still, sample_scene
 
-SCENES_PER_FILE = 250
-
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
 _SIZES = ((448, 252), (448, 336), (640, 360))
 _SHARES = (0.5, 0.35, 0.15)
@@ -98,14 +96,18 @@ def _misfit(lanes: Sequence[FloatArray], horizon: float) -> float:
     return float(((design @ solution - target) ** 2).sum())
 
 
-def rendered_frames(folder: Path, files: int, workers: int, done: Callable[[Path], None]) -> list[Path]:
-    """`files` files of `SCENES_PER_FILE` rendered frames each, numbered by seed; those already there are kept."""
+def rendered_frames(folder: Path, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
+    """A file of rendered frames for each number of `scenes`, the files seeded by their own number; kept where they are.
+
+    `done` is told how many scenes have become ready.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"frames-{number:04d}.npz" for number in range(files)]
-    missing = [(number, path) for number, path in enumerate(paths) if not path.exists()]
+    paths = [folder / f"frames-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
+    missing = [(number, scenes[number], path) for number, path in enumerate(paths) if not path.exists()]
+    done(sum(scenes) - sum(count for _, count, _ in missing))
     # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        running = {pool.submit(_render_file, number, path): path for number, path in missing}
+        running = {pool.submit(_render_file, *file): file[1] for file in missing}
         for future in as_completed(running):
             future.result()
             done(running[future])
@@ -167,13 +169,13 @@ def _note(frame: RoadFrame) -> dict[str, object]:
     }
 
 
-def _render_file(number: int, path: Path) -> None:
+def _render_file(number: int, scenes: int, path: Path) -> None:
     cv2.setNumThreads(1)
-    write_frames(path, _rendered(number))
+    write_frames(path, _rendered(number, scenes))
 
 
-def _rendered(number: int) -> Iterator[RoadFrame]:
-    for index in range(SCENES_PER_FILE):
+def _rendered(number: int, scenes: int) -> Iterator[RoadFrame]:
+    for index in range(scenes):
         rng = np.random.default_rng([number, index, 2])
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
         still = render_still(sample_scene(rng, width, height))

@@ -16,7 +16,7 @@ from lanestream_exporter.training.config import SHIPPED, ClassifierConfig, Train
 from lanestream_exporter.training.device import best_device, described
 from lanestream_exporter.training.loop import Progress as Learnt
 from lanestream_exporter.training.loop import Run, Task
-from lanestream_exporter.training.sources import patch_sources
+from lanestream_exporter.training.sources import origin_of, patch_files, remember_files
 
 _INTERRUPTED = 130
 
@@ -46,10 +46,12 @@ def classifier(config: Path, folder: Path, data: Path | None, patches: Path | No
     settings = read_config(config, ClassifierConfig)
     network = starting_network(settings)  # what is no checkpoint is told now, not after the patches have been made
     with _bar("rendering") as advance:
-        sources, origin = patch_sources(settings.data, patches or folder / "patches", data, advance)
+        files = patch_files(settings.data, patches or folder / "patches", data, advance)
+    remember_files(folder, files)
+    sources = [part.read() for part in files]
     for source in sources:
         click.echo(f"{source.name}: {len(source.train)} patches to train on, {len(source.check)} to validate with")
-    _learn(ClassifierTask(settings, network, sources, origin), settings, folder)
+    _learn(ClassifierTask(settings, network, sources, origin_of(settings.data)), settings, folder)
 
 
 @train.command()

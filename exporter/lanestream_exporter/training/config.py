@@ -89,18 +89,26 @@ class Frames(Section):
 class PatchData(Section):
     """Where patches come from, and which share of each batch is real: `final_real_share` in the last third.
 
-    Real frames are the project's own splits, or `train` and `validation` where they are given.
+    Real frames are the project's own splits; or those of `train`, which are validated with those of `validation`, or
+    with about `validation_share` of their drives where there are none.
     """
 
     rendered_scenes: NonNegativeInt = 5000
     validation_scenes: PositiveInt = 50
     real_share: Share = 0.15
     final_real_share: Share = 0.5
+    train: tuple[Frames, ...] = ()
+    validation: tuple[Frames, ...] = ()
+    validation_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.2
 
     @checked(mode="after")
     def _has_something(self) -> Self:
         if self.rendered_scenes == 0 and min(self.real_share, self.final_real_share) < 1.0:
             raise ValueError("without rendered scenes real_share and final_real_share must be 1")
+        if self.train and not self.wants_real:
+            raise ValueError("with frames to train on real_share or final_real_share must be more than 0")
+        if self.validation and not self.train:
+            raise ValueError("there are frames for validation and none to train on: add [[data.train]]")
         return self
 
     @property

@@ -1,0 +1,58 @@
+"""Patches of one's own labelled frames: read in any known form, divided by drive, never by frame."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+from lanestream.lanes import Image
+from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.reading import read_dataset
+from lanestream_exporter.datasets.splits import refuse_leak, split_by_group
+from lanestream_exporter.rendering import labelled_store
+from lanestream_exporter.training.config import Frames, PatchData
+
+
+def own_stores(data: PatchData, folder: Path) -> tuple[Path, Path]:
+    """Files of patches in `folder` from the frames that `data` names: to train on, and to validate with.
+
+    They are cut anew where the frames have changed. Raises LabelError for a record that can't be used, and where a
+    drive or clip is on both sides.
+    """
+    key = _fingerprint(data)
+    train, check = (folder / f"own-{use}-{key}.npz" for use in ("train", "validation"))
+    if not (train.exists() and check.exists()):
+        groups = [frame.group for frame, _ in _frames(data.train)]
+        if data.validation:
+            validation_groups = [frame.group for frame, _ in _frames(data.validation)]
+            refuse_leak(groups, validation_groups)
+            learnt, kept = set(groups), set(validation_groups)
+        else:
+            split = split_by_group(groups, data.validation_share)
+            learnt, kept = set(split.train), set(split.validation)
+        labelled_store(train, _of(data.train, learnt), to_train=True)
+        labelled_store(check, _of(data.validation or data.train, kept), to_train=False)
+    return train, check
+
+
+def _frames(sources: Sequence[Frames]) -> Iterator[tuple[LabelledFrame, Image]]:
+    for source in sources:
+        yield from read_dataset(Path(source.path), source.format)
+
+
+def _of(sources: Sequence[Frames], groups: Collection[str]) -> Iterator[tuple[LabelledFrame, Image]]:
+    return ((frame, image) for frame, image in _frames(sources) if frame.group in groups)
+
+
+def _fingerprint(data: PatchData) -> str:
+    """Changes with the sources, how they are divided, and the files in them."""
+    digest = hashlib.sha256(repr((data.train, data.validation, data.validation_share)).encode())
+    for source in (*data.train, *data.validation):
+        path = Path(source.path)
+        files = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for file in files:
+            if file.is_file():
+                status = file.stat()
+                digest.update(f"{file} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:12]
