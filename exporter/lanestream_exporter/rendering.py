@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from multiprocessing import get_context
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from lanestream.detection.candidates import CandidateSearch
 from lanestream.geometry import RoadView
+from lanestream.lanes import Image
+from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import Split, real_frames
 from lanestream_exporter.patches import PatchMaker
 from lanestream_exporter.patchstore import write_store
@@ -57,15 +59,20 @@ def files_of(scenes: int) -> list[int]:
 
 
 def real_store(folder: Path, root: Path, split: Split) -> Path:
-    """One file of patches from the labelled real frames of `split`; kept if it is already there.
-
-    Frames give their own candidates; those of the training split also candidates beside their labels, a few times.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
+    """One file of patches from the labelled real frames of `split`; kept if it is already there."""
     path = folder / f"real-{split}.npz"
     if not path.exists():
-        write_store(path, _real_patches(root, split))
+        labelled_store(path, real_frames(root, split), to_train=split == "train")
     return path
+
+
+def labelled_store(path: Path, frames: Iterable[tuple[LabelledFrame, Image]], to_train: bool) -> None:
+    """Writes one file of patches from labelled frames and their BGR pictures.
+
+    Frames give their own candidates; those to train on also candidates beside their labels, a few times.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_store(path, _labelled_patches(frames, to_train))
 
 
 def _leave_interrupts_to_the_parent() -> None:
@@ -87,13 +94,15 @@ def _rendered_patches(number: int, scenes: int) -> Iterator[tuple[NDArray[np.uin
         yield from maker.all_of(still.image, still.labels, view, rng)
 
 
-def _real_patches(root: Path, split: Split) -> Iterator[tuple[NDArray[np.uint8], int]]:
+def _labelled_patches(
+    frames: Iterable[tuple[LabelledFrame, Image]], to_train: bool
+) -> Iterator[tuple[NDArray[np.uint8], int]]:
     # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
-    maker = PatchMaker(CandidateSearch(limit=32)) if split == "train" else PatchMaker()
+    maker = PatchMaker(CandidateSearch(limit=32)) if to_train else PatchMaker()
     clear = partial(filter, lambda item: item[1] in (0, 1))
-    for number, (frame, image) in enumerate(real_frames(root, split)):
+    for number, (frame, image) in enumerate(frames):
         rng = np.random.default_rng([number, 1])
         proposals = maker.search.propose(image)
         yield from clear(zip(*maker.proposed(image, frame), strict=True))
-        for _ in range(_ROUNDS if split == "train" else 0):
+        for _ in range(_ROUNDS if to_train else 0):
             yield from clear(zip(*maker.jittered(image, frame, proposals.view, rng), strict=True))
