@@ -36,17 +36,17 @@ def check(path: Path, form: str, sheet: Path | None, against: Path | None) -> No
     PATH is a folder or a label file: TuSimple, CULane, Caltech, LabelMe, CVAT, mask images or clip labels. Ends with
     exit code 1 where anything is wrong.
     """
-    pictures = ContactSheet()
-    checked = _checked(path, form, pictures if sheet is not None else None)
+    pictures = ContactSheet(sheet) if sheet is not None else None
+    checked = _checked(path, form, pictures)
     faults = checked.faults
     if against is not None:
         other = _checked(against, "auto", None)
         faults = [*faults, *other.faults, *checked.leaks(other)]
-    if sheet is not None and len(pictures):
-        pictures.write(sheet)
-        click.echo(f"{sheet}: {len(pictures)} frames")
     for fault in faults:
         click.echo(f"bad: {fault}")
+    if pictures is not None and len(pictures):
+        pictures.write()
+        click.echo(f"{sheet}: {len(pictures)} frames")
     if faults:
         raise LabelError(
             f"{len(faults)} faults in {path}" if len(faults) > 1 else f"one fault in {path}", "named above"

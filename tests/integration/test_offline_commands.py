@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import labelfiles
 import pytest
 
 from lanestream.cli import main
@@ -18,6 +20,7 @@ class Done:
 
     code: object
     errors: str
+    output: str = ""
 
 
 Run = Callable[[str], Done]
@@ -32,7 +35,8 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
         monkeypatch.setattr(sys, "argv", ["lanestream", *line.split()])
         with pytest.raises(SystemExit) as ended:
             main()
-        return Done(ended.value.code, capsys.readouterr().err)
+        told = capsys.readouterr()
+        return Done(ended.value.code, told.err, told.out)
 
     return command
 
@@ -55,6 +59,10 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ("data check missing", "there is nothing at missing"),
+        ("data check none", "no labels that are known in none"),
+        ("data check none --sheet sheet.txt", "can't write a picture to sheet.txt"),
+        ("data check none --format cvat", "no labelled frames in none as cvat"),
         ("score missing.jsonl half.jsonl", "can't read missing.jsonl"),
         ("score text half.jsonl", "text:1 is no `lanes` message"),
         ("score binary half.jsonl", "binary is not a text file"),
@@ -86,3 +94,50 @@ def test_numbers_out_of_range_are_refused(run: Run, arguments: str) -> None:
     done = run(arguments)
     assert done.code == 2
     assert "Invalid value" in done.errors
+
+
+def test_data_check_tells_what_is_there_and_draws_it(run: Run, folder: Path) -> None:
+    draw = labelfiles.drawer(folder / "good")
+    for name in ("monday/a.jpg", "monday/b.jpg", "tuesday/c.jpg"):
+        draw(name)
+        labelfiles.labelme(
+            (folder / "good" / name).with_suffix(".json"), Path(name).name, labelfiles.strip(labelfiles.LEFT)
+        )
+    done = run("data check good --sheet out/sheet.jpg")
+    assert (done.code, done.errors) == (0, "")
+    lines = (
+        "good: labelme",
+        "frames: 3",
+        "lanes per frame: 1: 3",
+        "image sizes: 320 x 180: 3",
+        "rows covered: 100 to 170",
+    )
+    for line in lines:
+        assert line in done.output
+    assert "groups: 2: good/monday (2), good/tuesday (1)" in done.output
+    sheet = cv2.imread(str(folder / "out" / "sheet.jpg"))
+    assert sheet is not None
+    assert sheet.shape[1] == 3 * 320
+
+
+def test_data_check_names_every_fault_and_fails(run: Run, folder: Path) -> None:
+    labelfiles.drawer(folder / "faulty")("a.jpg")
+    good, far = (labelfiles.clip_record(image=name) for name in ("a.jpg", "gone.jpg"))
+    labelfiles.write_lines(folder / "faulty" / "labels.jsonl", good, far, "{", good)
+    done = run("data check faulty")
+    assert done.code == 1
+    assert done.errors == "error: 3 faults in faulty (named above)\n"
+    told = [line for line in done.output.splitlines() if line.startswith("bad: ")]
+    assert [line.split("labels.jsonl:")[1][0] for line in told] == ["2", "3", "4"]
+
+
+def test_data_check_names_a_leak(run: Run, folder: Path) -> None:
+    for name in ("train", "val"):
+        labelfiles.drawer(folder / name)(f"{name}.jpg")
+        labelfiles.write_lines(
+            folder / name / "labels.jsonl", labelfiles.clip_record(image=f"{name}.jpg", clip="road.mp4")
+        )
+    assert run("data check train").code == 0
+    done = run("data check train --against val")
+    assert done.code == 1
+    assert "'road' is in both train and validation" in done.output

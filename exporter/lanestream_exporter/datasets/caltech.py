@@ -70,14 +70,15 @@ def _entry(frame: Any, place: str, path: Path, folder: DataFolder) -> Entry:
     lanes, others = {}, []
     for number, label in enumerate(_items(frame.labels), start=1):
         points = points_of(np.atleast_2d(label.points))
-        if label.type in ("spline", "line"):
+        form = label.type if isinstance(label.type, str) else "unnamed"
+        if form in ("spline", "line"):
             kind, colour = _SUBTYPES.get(str(label.subtype), (None, None))
             lane_id = int(label.obj) if np.size(label.obj) == 1 else None
             # Pixels count from one there, from zero here.
-            curve = bezier(points) - 1.0 if label.type == "spline" else points - 1.0
+            curve = bezier(points) - 1.0 if form == "spline" else points - 1.0
             lanes[f"label {number}"] = LabelledLane(curve, lane_id, None, kind, colour)
         elif len(points):
-            others.append(str(label.type))
+            others.append(form)
     image = folder.find(path.parent / relative(frame.frame))
     group = drive_of(path.parent)
     return Entry(place, folder.name(image), group, Picture(image), lanes, others=tuple(others))

@@ -73,19 +73,25 @@ def clip_entries(folder: DataFolder) -> Entries:
     A clip is looked for beside its labels and in the folders `clips` and `videos`; each is a group.
     """
     for path in folder.with_suffix(".jsonl"):
-        found: list[Entry] = []
-        for place, record in all_records(path):
-            if isinstance(record, LabelError):
-                yield record
-                continue
-            try:
-                found.append(_entry(record, place, path, folder))
-            except (ValueError, KeyError, TypeError, AttributeError) as error:
-                yield unusable(place, error, _NEEDED)
-            except LabelError as error:
-                yield placed(place, error)
         # In order, because a video is decoded from its start.
-        yield from sorted(found, key=lambda entry: entry.picture.index or 0)
+        yield from sorted(_file_entries(path, folder), key=_frame_index)
+
+
+def _file_entries(path: Path, folder: DataFolder) -> Entries:
+    for place, record in all_records(path):
+        if isinstance(record, LabelError):
+            yield record
+            continue
+        try:
+            yield _entry(record, place, path, folder)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            yield unusable(place, error, _NEEDED)
+        except LabelError as error:
+            yield placed(place, error)
+
+
+def _frame_index(found: Entry | LabelError) -> int:
+    return 0 if isinstance(found, LabelError) else found.picture.index or 0
 
 
 def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -> Entry:

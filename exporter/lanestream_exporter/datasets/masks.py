@@ -27,7 +27,7 @@ from lanestream_exporter.datasets.labels import LabelledLane
 from lanestream_exporter.datasets.pictures import Picture, checked_header, file_bytes
 from lanestream_exporter.datasets.records import placed
 
-_MASK_FOLDERS: Final = frozenset({"mask", "masks", "labels", "segmentation"})
+_MASK_FOLDERS: Final = frozenset({"mask", "masks", "segmentation"})
 _IMAGE_FOLDERS: Final = ("images", "image", "imgs", "frames")
 _BESIDE: Final = "_mask"
 _MOST_INSTANCES: Final = 32
@@ -57,7 +57,7 @@ def mask_entries(folder: DataFolder) -> Entries:
 def _image_of(mask: Path, folder: DataFolder) -> Path:
     if mask.stem.endswith(_BESIDE):
         return folder.picture_of(mask.with_name(mask.stem[: -len(_BESIDE)]))
-    parts = mask.with_suffix("").parts
+    parts = mask.absolute().with_suffix("").parts
     at = max(number for number, part in enumerate(parts[:-1]) if part in _MASK_FOLDERS)
     for name in _IMAGE_FOLDERS:
         if Path(*parts[:at], name).is_dir():

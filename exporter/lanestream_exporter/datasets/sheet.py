@@ -18,6 +18,7 @@ _WIDTH: Final = 320  # pixels of a small picture
 _CAPTION: Final = 18  # pixels of height
 _MOST: Final = 60
 _SUBPIXEL_BITS: Final = 4
+_KINDS: Final = (".jpg", ".jpeg", ".png")
 
 Colour = tuple[int, int, int]  # blue, green, red
 
@@ -34,7 +35,13 @@ _IN_TURN: Final[tuple[Colour, ...]] = ((60, 220, 60), (60, 60, 255), (255, 200, 
 class ContactSheet:
     """Keeps up to 60 of the frames that are added, evenly spread over all of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path) -> None:
+        """Will be written to `path`. Raises SourceError where its suffix is of no kind of picture."""
+        if path.suffix.lower() not in _KINDS:
+            raise SourceError(
+                f"can't write a picture to {path}", f"a path that ends in {' or '.join(_KINDS)} is accepted"
+            )
+        self._path = path
         self._tiles: list[Image] = []
         self._stride = 1
         self._seen = 0
@@ -51,19 +58,14 @@ class ContactSheet:
             self._tiles = self._tiles[::2]
             self._stride *= 2
 
-    def write(self, path: Path) -> None:
-        """Writes the sheet as a JPEG or PNG file. Raises SourceError where that can't be done."""
+    def write(self) -> None:
+        """Writes the sheet. Raises SourceError where that can't be done."""
+        data = cv2.imencode(self._path.suffix.lower(), self._page())[1].tobytes()
         try:
-            good, data = cv2.imencode(path.suffix.lower(), self._page())
-        except cv2.error:
-            good = False
-        if not good:
-            raise SourceError(f"can't write a picture to {path}", "give a path that ends in .jpg or .png")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data.tobytes())
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._path.write_bytes(data)
         except OSError as error:
-            raise SourceError(f"can't write {path}: {(error.strerror or str(error)).lower()}") from None
+            raise SourceError(f"can't write {self._path}: {(error.strerror or str(error)).lower()}") from None
 
     def _chosen(self) -> list[Image]:
         count = min(_MOST, len(self._tiles))
@@ -71,9 +73,9 @@ class ContactSheet:
 
     def _page(self) -> Image:
         tiles = self._chosen()
-        columns = max(1, min(_COLUMNS, len(tiles)))
-        height = max((tile.shape[0] for tile in tiles), default=_CAPTION)
-        page = np.zeros((-(-len(tiles) // columns) * height or height, columns * _WIDTH, 3), np.uint8)
+        columns = min(_COLUMNS, len(tiles))
+        height = max(tile.shape[0] for tile in tiles)
+        page = np.zeros((-(-len(tiles) // columns) * height, columns * _WIDTH, 3), np.uint8)
         for number, tile in enumerate(tiles):
             top, left = number // columns * height, number % columns * _WIDTH
             page[top : top + tile.shape[0], left : left + _WIDTH] = tile

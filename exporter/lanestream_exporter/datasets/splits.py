@@ -105,8 +105,8 @@ class GroupSplit:
 def split_by_group(groups: Iterable[str], validation_share: float, seed: int = 0) -> GroupSplit:
     """Divides frames by drive or clip; `groups` has the `frame.group` of every frame, in any order.
 
-    Whole groups in an order drawn with `seed` go to validation while that brings its frames nearer to
-    `validation_share` (0 to 1) of all; each side has a group at least. The same frames and seed give the same split.
+    Whole groups in an order drawn with `seed` go to validation, as many as come nearest to `validation_share` (0 to 1)
+    of all frames; each side has a group at least. The same frames and seed give the same split.
     Raises LabelError where there are fewer than two groups, because one can't be divided.
     """
     sizes = Counter(groups)
@@ -121,9 +121,13 @@ def split_by_group(groups: Iterable[str], validation_share: float, seed: int = 0
     validation: set[str] = set()
     taken = 0
     for name in order:
-        if abs(taken + sizes[name] - wanted) < abs(taken - wanted):
+        if taken + sizes[name] <= wanted:
             validation.add(name)
             taken += sizes[name]
+    # One more where a little too much is nearer than a little too few.
+    left = [name for name in order if name not in validation]
+    if left and abs(taken + (least := min(sizes[name] for name in left)) - wanted) < wanted - taken:
+        validation.add(next(name for name in left if sizes[name] == least))
     if not validation:
         validation.add(min(order, key=lambda name: sizes[name]))
     if len(validation) == len(names):
