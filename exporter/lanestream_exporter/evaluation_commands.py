@@ -3,44 +3,73 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+from rich.console import Console
 
 from lanestream.engine import SHIPPED_MODEL, load_engine
+from lanestream.errors import LabelError, ModelError, SourceError, needs_extra
+from lanestream_exporter.datasets.formats import FORMATS
+from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.evaluation.measuring import Evaluation
+from lanestream_exporter.evaluation.measuring import Material
+from lanestream_exporter.evaluation.measuring import evaluate as measure
+from lanestream_exporter.evaluation.methods import Method, Model, Peer
+from lanestream_exporter.evaluation.peers import HoughLinesPeer, SlidingWindowPeer
 from lanestream_exporter.evaluation.score import score as measured
+from lanestream_exporter.evaluation.tables import tables
 
-_DATA = click.option(
-    "--data", type=click.Path(path_type=Path), help="Folder of real frames [default: $LANESTREAM_DATA]."
-)
+if TYPE_CHECKING:
+    from lanestream_exporter.datasets.splits import Split
 
 
 @click.command()
-@click.option("--model", type=click.Path(path_type=Path), default=SHIPPED_MODEL, show_default="the shipped one")
+@click.option(
+    "--model",
+    "models",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    default=[SHIPPED_MODEL],
+    help="ONNX file; give it again for another one.  [default: the shipped classifier]",
+)
 @click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Also write the figures to this file.")
-@_DATA
-def evaluate(model: Path, split: str, json_path: Path | None, data: Path | None) -> None:
-    """Measure a model file on the labelled real frames of a split.
+@click.option("--out", type=click.Path(path_type=Path), help="Folder that report.html is written to.")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path),
+    help="Labelled frames of your own, or the folder of real frames that --split is of.  [default: $LANESTREAM_DATA]",
+)
+@click.option(
+    "--format", "form", type=click.Choice(["auto", *FORMATS]), default="auto", help="The form of your labels."
+)
+def evaluate(
+    models: Sequence[Path], split: Split, out: Path | None, json_path: Path | None, data: Path | None, form: str
+) -> None:
+    """Measure model files and two classical peers on labelled frames.
 
-    Prints candidates (precision, recall, accuracy, proposal recall), and boundaries of single images and of clips.
+    Candidates (level A), boundaries of single images and of clips (B), and the field's metrics (C); docs/evaluation.md
+    describes every figure. Your own frames are measured as single images, all of them.
     """
-    root = data_root(data)
-    engine = load_engine(model, "cpu")
-    evaluation = Evaluation(engine)
-    figures = {
-        "model": engine.network.name,
-        "split": split,
-        "images": evaluation.images(root, split),  # type: ignore[arg-type]  # click has checked it
-        "clips": evaluation.clips(root, split),  # type: ignore[arg-type]
-    }
-    text = json.dumps(figures, indent=2)
-    click.echo(text)
+    material = _material(data, form, split)
+    evaluation = measure(_methods(models), material, lambda stage: click.echo(f"measuring {stage} ...", err=True))
+    figures = evaluation.figures()
+    console = Console(soft_wrap=True)
+    for table in tables(figures):
+        console.print(table)
     if json_path is not None:
-        json_path.parent.mkdir(parents=True, exist_ok=True)
-        json_path.write_text(text + "\n")
+        with _writing(json_path):
+            json_path.parent.mkdir(parents=True, exist_ok=True)
+            json_path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    if out is not None:
+        with needs_extra("train"), _writing(out):
+            from lanestream_exporter.evaluation.report import write_report
+
+            click.echo(f"report: {write_report(out, evaluation, figures)}")
 
 
 @click.command()
@@ -49,3 +78,31 @@ def evaluate(model: Path, split: str, json_path: Path | None, data: Path | None)
 def score(results: Path, labels: Path) -> None:
     """Measure RESULTS, a file that `stream --jsonl` wrote, against the LABELS of the clip."""
     click.echo(json.dumps(measured(results, labels), indent=2))
+
+
+def _material(data: Path | None, form: str, split: Split) -> Material:
+    """The project's split where `data` is its folder of real frames, else all that is labelled in `data`."""
+    if data is None:
+        return Material.of_split(data_root(), split)
+    if form == "auto":
+        with suppress(LabelError):
+            return Material.of_split(data_root(data), split)
+    return Material(data.name, lambda: read_dataset(data, form))
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SourceError(f"can't write {path}: {(error.strerror or str(error)).lower()}") from None
+
+
+def _methods(models: Sequence[Path]) -> list[Method]:
+    ours = [Model(load_engine(path, "cpu")) for path in models]
+    methods: list[Method] = [*ours, Peer(HoughLinesPeer()), Peer(SlidingWindowPeer())]
+    names = [method.name for method in methods]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ModelError(f"two of the models are named {twice!r}", "give models of different names or versions")
+    return methods

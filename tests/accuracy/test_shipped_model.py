@@ -8,7 +8,8 @@ import pytest
 
 from lanestream.engine import SHIPPED_MODEL, Engine, load_engine
 from lanestream_exporter.datasets.splits import highway_clip, real_frames
-from lanestream_exporter.evaluation.measuring import Evaluation
+from lanestream_exporter.evaluation.measuring import Material, evaluate
+from lanestream_exporter.evaluation.methods import Model
 
 
 @pytest.fixture(scope="module")
@@ -24,20 +25,26 @@ def test_the_shipped_files_are_small() -> None:
 
 
 def test_the_easy_clip_is_tracked_exactly(engine: Engine, data: Path) -> None:
-    figures = Evaluation(engine).clip(highway_clip(data, "highway_white_right"))
-    assert figures["frames"] == 221
-    assert figures["both_ego"] >= 0.98
-    assert figures["ego"]["precision"] >= 0.98
-    assert figures["ego"]["recall"] >= 0.98
-    assert figures["ego"]["mean_error_px_640"] <= 1.5
+    material = Material("easy", lambda: (), (highway_clip(data, "highway_white_right"),))
+    run = evaluate([Model(engine)], material).clips[engine.network.name]["highway_white_right"]
+    figures = run.figures()
+    assert figures["steadiness"]["frames"] == 221
+    assert figures["steadiness"]["both_ego"] >= 0.98
+    assert figures["steadiness"]["id_switches"] == 0
+    ego = figures["tracked"]["ego"]
+    assert ego["right"] + ego["missed"] == 30
+    assert ego["precision"] >= 0.98
+    assert ego["recall"] >= 0.98
+    assert ego["mean_error_px_640"] <= 1.5
 
 
 def test_single_images_of_the_validation_split(engine: Engine, data: Path) -> None:
     """A floor, not a figure to be proud of: it catches a broken model file or a broken proposal stage."""
-    figures = Evaluation(engine).images(data, "val")["tusimple 0313-1"]
-    assert figures["candidates"]["proposal_recall_ego"] >= 0.85
-    assert figures["ego"]["precision"] >= 0.85
-    assert figures["ego"]["recall"] >= 0.85
+    material = Material("val", lambda: real_frames(data, "val"))
+    figures = evaluate([Model(engine)], material).figures()["images"][engine.network.name]["tusimple 0313-1"]
+    assert figures["candidates"]["proposal_recall"]["ego"]["recall_16"] >= 0.85
+    assert figures["boundaries"]["ego"]["precision"] >= 0.85
+    assert figures["boundaries"]["ego"]["recall"] >= 0.85
 
 
 def test_splits_share_no_frame(data: Path) -> None:

@@ -24,13 +24,17 @@ _BOTTOM = 0.9722  # the row, as a share of the height, at which sides are told: 
 
 @dataclass(frozen=True)
 class Found:
-    """A boundary that was reported: its curve, the rows it was reported for, its position, its identity if any."""
+    """A boundary that was reported: its curve, the rows it was reported for, its position, its identity if any.
+
+    `farthest` is the row that it may be continued up to, where that is not almost its horizon.
+    """
 
     curve: Curve
     top: float
     bottom: float
     position: int
     track_id: int | None = None
+    farthest: float | None = None
 
     @classmethod
     def of(cls, lane: LaneBoundary) -> Found:

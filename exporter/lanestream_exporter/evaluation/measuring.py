@@ -1,132 +1,148 @@
-"""Measuring a model file on labelled frames, at two levels that are never mixed.
-
-A: the classifier on the candidates that were proposed, and what was proposed at all. B: boundaries per frame, the ego
-pair and all of them, from single images and, on clips, with the tracker.
-"""
+"""One evaluation: the same frames through every method, and all figures of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from sklearn.metrics import average_precision_score
 
-from lanestream.detection import Prepared
-from lanestream.engine import Engine
-from lanestream.errors import SourceError
-from lanestream.lanes import FrameResult, Image
+from lanestream.errors import LabelError, SourceError
+from lanestream.lanes import Image
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import LabelledClip, Split, labelled_clips, real_frames
-from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
-from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, TruthRule, distance_along
+from lanestream_exporter.evaluation.boundaries import Found
+from lanestream_exporter.evaluation.candidates import candidate_figures
+from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
+from lanestream_exporter.evaluation.methods import Method
+from lanestream_exporter.evaluation.outcomes import Outcome
+from lanestream_exporter.evaluation.steadiness import steadiness
+
+SCHEMA = 1
+OVERALL = "overall"
+
+Frames = Callable[[], Iterable[tuple[LabelledFrame, Image]]]
+
+
+@dataclass(frozen=True)
+class Material:
+    """What is measured on: single labelled images, read anew at each call of `images`, and labelled clips."""
+
+    name: str
+    images: Frames
+    clips: tuple[LabelledClip, ...] = ()
+
+    @classmethod
+    def of_split(cls, root: Path, split: Split) -> Material:
+        """The project's own frames of a split, below the data folder `root`."""
+        return cls(split, lambda: real_frames(root, split), tuple(labelled_clips(root, split)))
 
 
 @dataclass
-class CandidateTally:
-    """Level A: probabilities and verdicts of all candidates, and which labels had a candidate."""
+class ClipRun:
+    """A clip as one method saw it: every frame of it in order, and its labelled frames with the memory and without."""
 
-    probabilities: list[float] = field(default_factory=list)
-    verdicts: list[int] = field(default_factory=list)
-    ego_proposed: list[bool] = field(default_factory=list)
-    all_proposed: list[bool] = field(default_factory=list)
+    reported: list[tuple[Found, ...]] = field(default_factory=list)
+    tracked: list[Outcome] = field(default_factory=list)
+    alone: list[Outcome] = field(default_factory=list)
+    size: tuple[int, int] = (1, 1)
 
-    def summary(self, threshold: float) -> dict[str, Any]:
-        """Precision, recall and accuracy over clearly true and false candidates, with counts; proposal recall."""
-        verdicts, probability = np.array(self.verdicts), np.array(self.probabilities)
-        clear = (verdicts == TRUE) | (verdicts == FALSE)
-        truth, accepted = verdicts[clear] == TRUE, probability[clear] >= threshold
-        right, wrong = int((accepted & truth).sum()), int((accepted & ~truth).sum())
-        missed, refused = int((~accepted & truth).sum()), int((~accepted & ~truth).sum())
+    def figures(self) -> dict[str, Any]:
+        """Level B both ways, and steadiness."""
         return {
-            "candidates": len(verdicts),
-            "true": int(truth.sum()),
-            "false": int((~truth).sum()),
-            "unknown": int((verdicts == UNKNOWN).sum()),
-            "unsure": int(len(verdicts) - clear.sum() - (verdicts == UNKNOWN).sum()),
-            "confusion": {"tp": right, "fp": wrong, "fn": missed, "tn": refused},
-            "precision": _ratio(right, right + wrong),
-            "recall": _ratio(right, right + missed),
-            "accuracy": _ratio(right + refused, len(truth)),
-            "average_precision": round(float(average_precision_score(truth, probability[clear])), 4),
-            "base_rate": _ratio(int(truth.sum()), len(truth)),
-            "proposal_recall_ego": _ratio(sum(self.ego_proposed), len(self.ego_proposed)),
-            "proposal_recall_all": _ratio(sum(self.all_proposed), len(self.all_proposed)),
-            "labelled_ego": len(self.ego_proposed),
-            "labelled_all": len(self.all_proposed),
+            "tracked": boundary_figures(self.tracked),
+            "alone": boundary_figures(self.alone),
+            "steadiness": steadiness(self.reported, self.tracked, self.size),
         }
 
 
+@dataclass
 class Evaluation:
-    """Measures an engine: its detector, its network, and the tracker of its sessions."""
+    """The outcomes of every method: by method on images, by method and clip on clips."""
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
-        self._detector = engine.detector
-        self._rule = TruthRule()
+    material: Material
+    methods: tuple[Method, ...]
+    images: dict[str, list[Outcome]]
+    clips: dict[str, dict[str, ClipRun]]
 
-    def images(self, root: Path, split: Split) -> dict[str, Any]:
-        """Every labelled frame of `split` as a single image, a drive at a time: levels A and B."""
-        tallies: dict[str, tuple[CandidateTally, Tally, Tally]] = {}
-        for frame, image in real_frames(root, split):
-            candidates, ego, every = tallies.setdefault(frame.group, (CandidateTally(), Tally(), Tally()))
-            prepared = self._detector.prepare(image)
-            outputs = self._engine.network.run(prepared.inputs)
-            self._count_candidates(candidates, prepared, outputs, frame)
-            session = self._engine.open_session()
-            _count_boundaries(ego, every, session.conclude(prepared, outputs, 0.0), frame)
+    def figures(self) -> dict[str, Any]:
+        """All figures, as written to the JSON file: every key is in docs/evaluation.md."""
         return {
-            group: {
-                "candidates": candidates.summary(self._detector.threshold),
-                "ego": ego.summary(),
-                "all": every.summary(),
-            }
-            for group, (candidates, ego, every) in tallies.items()
+            "schema": SCHEMA,
+            "material": self.material.name,
+            "methods": {method.name: {"kind": method.kind} for method in self.methods},
+            "images": {method.name: self._of_images(method) for method in self.methods},
+            "clips": {method.name: self._of_clips(method) for method in self.methods},
         }
 
-    def clips(self, root: Path, split: Split) -> dict[str, Any]:
-        """The labelled clips of `split` frame after frame with the tracker: level B."""
-        return {clip.name: self.clip(clip) for clip in labelled_clips(root, split)}
+    def _of_images(self, method: Method) -> dict[str, Any]:
+        outcomes = self.images[method.name]
+        return {drive: image_figures(method, part) for drive, part in by_drive(outcomes).items()}
 
-    def clip(self, clip: LabelledClip) -> dict[str, Any]:
-        """One labelled clip with the tracker, every frame of it in order: level B at its labelled frames."""
-        wanted = read_clip_labels(clip.labels)
-        session = self._engine.open_session()
-        ego, every, both, seen = Tally(), Tally(), 0, 0
-        for index, image, timestamp in _decoded(clip.video, clip.frames):
-            result = self._engine.process(session, image, timestamp)
-            both += result.ego.left is not None and result.ego.right is not None
-            seen += 1
+    def _of_clips(self, method: Method) -> dict[str, Any]:
+        runs = self.clips[method.name]
+        figures = {name: run.figures() for name, run in runs.items()}
+        if not runs:
+            return {}
+        tracked = [outcome for run in runs.values() for outcome in run.tracked]
+        alone = [outcome for run in runs.values() for outcome in run.alone]
+        return {**figures, OVERALL: {"tracked": boundary_figures(tracked), "alone": boundary_figures(alone)}}
+
+
+def image_figures(method: Method, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """All figure groups of a method on single images. A further group is one more entry here."""
+    figures: dict[str, Any] = {"boundaries": boundary_figures(outcomes), "field": field_figures(outcomes)}
+    if method.threshold is not None:
+        figures["candidates"] = candidate_figures(outcomes, method.threshold)
+    return figures
+
+
+def by_drive(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
+    """The outcomes of each drive, and all of them together under `overall`."""
+    drives: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        drives.setdefault(outcome.frame.group, []).append(outcome)
+    return {**drives, OVERALL: list(outcomes)}
+
+
+def evaluate(methods: Sequence[Method], material: Material, tell: Callable[[str], None] = lambda _: None) -> Evaluation:
+    """Every method on every frame of `material`; `tell` hears what is being done.
+
+    Raises LabelError and SourceError for material that can't be read, or of which nothing is labelled.
+    """
+    images: dict[str, list[Outcome]] = {method.name: [] for method in methods}
+    tell("single images")
+    for frame, image in material.images():
+        for method in methods:
+            images[method.name].append(method.look(image, frame))
+    clips: dict[str, dict[str, ClipRun]] = {method.name: {} for method in methods}
+    for clip in material.clips:
+        tell(clip.name)
+        for name, run in _follow(methods, clip).items():
+            clips[name][clip.name] = run
+    if methods and not images[methods[0].name] and not material.clips:
+        raise LabelError(f"nothing is labelled in {material.name}", "give labelled images")
+    return Evaluation(material, tuple(methods), images, clips)
+
+
+def _follow(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]:
+    wanted = read_clip_labels(clip.labels, clip.exhaustive)
+    runs = {method.name: ClipRun() for method in methods}
+    followers = {method.name: method.follow() for method in methods}
+    for index, image, timestamp in _decoded(clip.video, clip.frames):
+        for method in methods:
+            run = runs[method.name]
+            found = followers[method.name](image, timestamp)
+            run.reported.append(found)
+            run.size = (image.shape[1], image.shape[0])
             if index in wanted:
-                _count_boundaries(ego, every, result, wanted[index])
-        return {"frames": seen, "both_ego": _ratio(both, seen), "ego": ego.summary(), "all": every.summary()}
-
-    def _count_candidates(
-        self, tally: CandidateTally, prepared: Prepared, outputs: NDArray[np.float32], frame: LabelledFrame
-    ) -> None:
-        verdicts = self._rule.judge(prepared.candidates, frame, prepared.view)
-        tally.verdicts += [int(v) for v in verdicts]
-        tally.probabilities += [float(p) for p in outputs[:, 1]]
-        ego = ego_labels(frame)
-        for lane in frame.lanes:
-            near = any(
-                distance * 1280.0 / frame.width <= self._rule.near and overlap >= self._rule.overlap
-                for distance, overlap in (distance_along(c, lane, prepared.view) for c in prepared.candidates)
-            )
-            tally.all_proposed.append(near)
-            if any(lane is mine for mine in ego):
-                tally.ego_proposed.append(near)
-
-
-def _count_boundaries(ego: Tally, every: Tally, result: FrameResult, frame: LabelledFrame) -> None:
-    found = [Found(lane.curve, lane.top, lane.bottom, lane.position) for lane in result.lanes]
-    count(ego, [f for f in found if f.position in (-1, 1)], ego_labels(frame), frame)
-    count(every, found, frame.lanes, frame)
+                run.tracked.append(Outcome(wanted[index], found))
+                run.alone.append(method.look(image, wanted[index]))
+    return runs
 
 
 def _decoded(video: Path, frames: range) -> Iterator[tuple[int, Image, float]]:
@@ -144,7 +160,3 @@ def _decoded(video: Path, frames: range) -> Iterator[tuple[int, Image, float]]:
             yield index, np.asarray(image, dtype=np.uint8), index / fps
     finally:
         capture.release()
-
-
-def _ratio(part: int, whole: int) -> float | None:
-    return round(part / whole, 4) if whole else None

@@ -1,0 +1,130 @@
+"""Level A: the classifier on the candidates of its frames, and what was proposed at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.metrics import average_precision_score
+
+from lanestream.lanes import FloatArray
+from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
+from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, RULES, JudgedCandidates, Outcome
+from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, UNSURE
+
+_BINS = 10
+
+
+def candidate_figures(outcomes: Sequence[Outcome], threshold: float) -> dict[str, Any]:
+    """Every figure of level A under both rules for what is false; see docs/evaluation.md."""
+    return {
+        "threshold": threshold,
+        **{rule: _judged(outcomes, rule, threshold) for rule in RULES},
+        "proposal_recall": {"ego": _proposed(outcomes, True), "all": _proposed(outcomes, False)},
+    }
+
+
+def clear_candidates(outcomes: Sequence[Outcome], rule: str) -> tuple[NDArray[np.bool_], FloatArray]:
+    """(truth, probability), each (N,), of the candidates that are clearly true or false."""
+    pairs = [_clear(judged, rule) for judged in _all(outcomes)]
+    truth = np.concatenate([t for t, _ in pairs]) if pairs else np.zeros(0, bool)
+    return truth, np.concatenate([p for _, p in pairs]) if pairs else np.zeros(0)
+
+
+def _judged(outcomes: Sequence[Outcome], rule: str, threshold: float) -> dict[str, Any]:
+    truth, probability = clear_candidates(outcomes, rule)
+    counts = np.array([_confusion(*_clear(judged, rule), threshold) for judged in _all(outcomes)]).reshape(-1, 4)
+    frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
+    verdicts = np.concatenate([judged.verdicts[rule] for judged in _all(outcomes)] or [np.zeros(0, np.int64)])
+    names = {"true": TRUE, "false": FALSE, "unsure": UNSURE, "unknown": UNKNOWN}
+    both = truth.any() and not truth.all()
+    return {
+        "candidates": len(verdicts),
+        **{name: int((verdicts == value).sum()) for name, value in names.items()},
+        "confusion": dict(zip(("tp", "fp", "fn", "tn"), map(int, counts.sum(axis=0)), strict=True)),
+        "base_rate": round(float(truth.mean()), 4) if len(truth) else None,
+        **measured(counts, frames, _rates),
+        "average_precision": round(float(average_precision_score(truth, probability)), 4) if both else None,
+        "calibration": _calibration(truth, probability),
+        "intervals": intervals(counts, frames, _rates),
+    }
+
+
+def _rates(counts: FloatArray) -> dict[str, FloatArray]:
+    tp, fp, fn, tn = counts.T
+    return {
+        "precision": ratio(tp, tp + fp),
+        "recall": ratio(tp, tp + fn),
+        "accuracy": ratio(tp + tn, tp + fp + fn + tn),
+        "balanced_accuracy": 0.5 * (ratio(tp, tp + fn) + ratio(tn, tn + fp)),
+    }
+
+
+def _calibration(truth: NDArray[np.bool_], probability: FloatArray) -> dict[str, Any]:
+    """Ten bins of equal width, and the expected calibration error: their gaps weighed by their counts.
+
+    After C. Guo et al., "On calibration of modern neural networks", 2017, for the probability of being true.
+    """
+    place = np.minimum((probability * _BINS).astype(int), _BINS - 1)
+    bins, error = [], 0.0
+    for index in range(_BINS):
+        inside = place == index
+        said, was = (probability[inside], truth[inside]) if inside.any() else (np.full(1, np.nan), np.full(1, np.nan))
+        error += abs(float(was.mean() - said.mean())) * int(inside.sum()) / len(truth) if inside.any() else 0.0
+        bins.append(
+            {
+                "low": index / _BINS,
+                "high": (index + 1) / _BINS,
+                "count": int(inside.sum()),
+                "mean_probability": round(float(said.mean()), 4) if inside.any() else None,
+                "true_share": round(float(was.mean()), 4) if inside.any() else None,
+            }
+        )
+    return {"expected_error": round(error, 4) if len(truth) else None, "bins": bins}
+
+
+def _proposed(outcomes: Sequence[Outcome], ego: bool) -> dict[str, Any]:
+    """Of the labels, how many have a true candidate among the first 1, 2, ... 32."""
+    labels = [[p for p in judged.proposed if p.ego or not ego] for judged in _all(outcomes)]
+    frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
+    places = [[p.place for p in frame if p.place is not None] for frame in labels]
+    reached = np.array([np.bincount(p, minlength=MOST_CANDIDATES).cumsum() for p in map(_integers, places)])
+    counts = np.column_stack([reached.reshape(-1, MOST_CANDIDATES), [len(frame) for frame in labels]])
+    total = counts.sum(axis=0)
+    return {
+        "labels": int(total[-1]),
+        "found": [int(n) for n in total[:-1]],
+        "recall": [round(float(n / total[-1]), 4) if total[-1] else None for n in total[:-1]],
+        **measured(counts, frames, _recalls),
+        "intervals": intervals(counts, frames, _recalls),
+    }
+
+
+def _recalls(counts: FloatArray) -> dict[str, FloatArray]:
+    return {f"recall_{limit}": ratio(counts[:, limit - 1], counts[:, -1]) for limit in (8, 16, 32)}
+
+
+def _all(outcomes: Sequence[Outcome]) -> list[JudgedCandidates]:
+    return [outcome.candidates for outcome in outcomes if outcome.candidates is not None]
+
+
+def _clear(judged: JudgedCandidates, rule: str) -> tuple[NDArray[np.bool_], FloatArray]:
+    verdicts = judged.verdicts[rule]
+    clear = (verdicts == TRUE) | (verdicts == FALSE)
+    return verdicts[clear] == TRUE, judged.probabilities[clear]
+
+
+def _confusion(truth: NDArray[np.bool_], probability: FloatArray, threshold: float) -> tuple[int, int, int, int]:
+    said = probability >= threshold
+    return (
+        int((said & truth).sum()),
+        int((said & ~truth).sum()),
+        int((~said & truth).sum()),
+        int((~said & ~truth).sum()),
+    )
+
+
+def _integers(values: Sequence[int]) -> NDArray[np.int64]:
+    return np.asarray(values, dtype=np.int64)

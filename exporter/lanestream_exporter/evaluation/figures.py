@@ -1,0 +1,126 @@
+"""Levels B and C: boundaries per frame, and the field's metrics, from the outcomes of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lanestream.lanes import FloatArray
+from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.evaluation import culane, tusimple
+from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
+from lanestream_exporter.evaluation.boundaries import Verdict, errors_along, match, match_ego
+from lanestream_exporter.evaluation.outcomes import Outcome
+
+_SHARES = 10  # bins of the error against depth
+
+
+def boundary_figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Level B: the ego pair and all boundaries; see docs/evaluation.md."""
+    ego = [match_ego(outcome.found, outcome.frame) for outcome in outcomes]
+    return {"ego": _matched(outcomes, ego), "all": _matched(outcomes, [match_all(outcome) for outcome in outcomes])}
+
+
+def match_all(outcome: Outcome) -> Verdict:
+    """All reported boundaries of a frame against all its labels."""
+    return match(outcome.found, outcome.frame.lanes, outcome.frame)
+
+
+def field_figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Level C: TuSimple's and CULane's metrics; see docs/evaluation.md."""
+    return {"tusimple": _tusimple(outcomes), "culane": _culane(outcomes)}
+
+
+def _matched(outcomes: Sequence[Outcome], verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    rows = [(len(v.pairs), v.wrong, v.missed, v.absent, sum(p.error for p in v.pairs), 1) for v in verdicts]
+    counts = np.array(rows, dtype=float).reshape(-1, 6)
+    right, wrong, missed, absent = (int(n) for n in counts[:, :4].sum(axis=0))
+    errors = [pair.error for verdict in verdicts for pair in verdict.pairs]
+    return {
+        "frames": len(outcomes),
+        "right": right,
+        "wrong": wrong,
+        "missed": missed,
+        "absent": absent,
+        **measured(counts, _frames(outcomes), _boundary_rates),
+        "median_error_px_640": round(float(np.median(errors)), 4) if errors else None,
+        "error_by_depth": _by_depth(outcomes, verdicts),
+        "intervals": intervals(counts, _frames(outcomes), _boundary_rates),
+    }
+
+
+def _boundary_rates(counts: FloatArray) -> dict[str, FloatArray]:
+    right, wrong, missed, absent, error, frames = counts.T
+    return {
+        "precision": ratio(right, right + wrong),
+        "recall": ratio(right, right + missed),
+        "f1": ratio(2.0 * right, 2.0 * right + wrong + missed),
+        "jaccard": ratio(right, right + wrong + missed),
+        "accuracy": ratio(right + absent, right + wrong + missed + absent),
+        "mean_error_px_640": ratio(error, right),
+        "false_per_frame": ratio(wrong, frames),
+    }
+
+
+def _by_depth(outcomes: Sequence[Outcome], verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """Mean error of right boundaries by depth: from the frame's highest labelled row (0) to its lowest row (1)."""
+    total, number = np.zeros(_SHARES), np.zeros(_SHARES)
+    for outcome, verdict in zip(outcomes, verdicts, strict=True):
+        for pair in verdict.pairs:
+            rows, errors = errors_along(outcome.found[pair.found], pair.label, outcome.frame.width)
+            place = np.minimum((_depth(rows, outcome.frame) * _SHARES).astype(int), _SHARES - 1)
+            total += np.bincount(place, errors, _SHARES)
+            number += np.bincount(place, minlength=_SHARES)
+    means = [round(float(t / n), 4) if n else None for t, n in zip(total, number, strict=True)]
+    return {"samples": [int(n) for n in number], "mean_px_640": means}
+
+
+def _depth(rows: FloatArray, frame: LabelledFrame) -> FloatArray:
+    top = min(float(lane.points[:, 1].min()) for lane in frame.lanes)
+    return np.clip((rows - top) / max(frame.height - 1.0 - top, 1.0), 0.0, 1.0)
+
+
+def _tusimple(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    scores = [tusimple.score_frame(outcome.found, outcome.frame) for outcome in outcomes]
+    counts = np.array([(s.accuracy, s.fp, s.fn, 1.0) for s in scores]).reshape(-1, 4)
+    return {
+        "frames": len(outcomes),
+        "labels": sum(len(outcome.frame.lanes) for outcome in outcomes),
+        **measured(counts, _frames(outcomes), _tusimple_means),
+        "intervals": intervals(counts, _frames(outcomes), _tusimple_means),
+    }
+
+
+def _tusimple_means(counts: FloatArray) -> dict[str, FloatArray]:
+    accuracy, fp, fn, frames = counts.T
+    fp, fn = ratio(fp, frames), ratio(fn, frames)
+    return {"accuracy": ratio(accuracy, frames), "fp": fp, "fn": fn, "f1": _harmonic(1.0 - fp, 1.0 - fn)}
+
+
+def _harmonic(precision: FloatArray, recall: FloatArray) -> FloatArray:
+    return ratio(2.0 * precision * recall, precision + recall)
+
+
+def _culane(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    counted = [culane.count_frame(outcome.found, outcome.frame) for outcome in outcomes]
+    counts = np.array([(c.tp, c.fp, c.fn) for c in counted], dtype=float).reshape(-1, 3)
+    tp, fp, fn = (int(n) for n in counts.sum(axis=0))
+    return {
+        "frames": len(outcomes),
+        "tp": tp,
+        "fp": fp,
+        "fn": fn,
+        **measured(counts, _frames(outcomes), _culane_rates),
+        "intervals": intervals(counts, _frames(outcomes), _culane_rates),
+    }
+
+
+def _culane_rates(counts: FloatArray) -> dict[str, FloatArray]:
+    tp, fp, fn = counts.T
+    return {"precision": ratio(tp, tp + fp), "recall": ratio(tp, tp + fn), "f1": ratio(2.0 * tp, 2.0 * tp + fp + fn)}
+
+
+def _frames(outcomes: Sequence[Outcome]) -> list[LabelledFrame]:
+    return [outcome.frame for outcome in outcomes]

@@ -1,0 +1,59 @@
+"""What is kept of a frame that a method has looked at: enough for every figure, without the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.detection import Prepared
+from lanestream.detection.candidates import Proposals
+from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.evaluation.boundaries import Found, ego_sides
+from lanestream_exporter.patches import TruthRule, distance_along
+
+MOST_CANDIDATES = 32
+
+RULES = {"far_40": TruthRule(far=40.0), "far_30": TruthRule(far=30.0)}
+
+
+@dataclass(frozen=True)
+class Proposed:
+    """A label and the place (from 0) of the first candidate that is true to it; None where none of the 32 is."""
+
+    ego: bool
+    place: int | None
+
+
+@dataclass(frozen=True)
+class JudgedCandidates:
+    """Level A of one frame: probabilities (N,), verdicts (N,) under each of `RULES`, and what was proposed at all."""
+
+    probabilities: NDArray[np.float64]
+    verdicts: dict[str, NDArray[np.int64]]
+    proposed: tuple[Proposed, ...]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A labelled frame, what a method reported for it and, for a classifier, its candidates."""
+
+    frame: LabelledFrame
+    found: tuple[Found, ...]
+    candidates: JudgedCandidates | None = None
+
+
+def judge(
+    prepared: Prepared, outputs: NDArray[np.float32], proposals: Proposals, frame: LabelledFrame
+) -> JudgedCandidates:
+    """The candidates that the classifier saw against the labels, and up to 32 of those that could be proposed."""
+    verdicts = {name: rule.judge(prepared.candidates, frame, prepared.view) for name, rule in RULES.items()}
+    ego, near = ego_sides(frame), RULES["far_40"]
+    proposed = []
+    for lane in frame.lanes:
+        measured = [distance_along(c, lane, proposals.view) for c in proposals.candidates[:MOST_CANDIDATES]]
+        true = [d * 1280.0 / frame.width <= near.near and overlap >= near.overlap for d, overlap in measured]
+        place = true.index(True) if any(true) else None
+        proposed.append(Proposed(any(lane is mine for mine in ego), place))
+    return JudgedCandidates(np.asarray(outputs[:, 1], dtype=np.float64), verdicts, tuple(proposed))

@@ -1,0 +1,68 @@
+"""The figures that matter most, for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+# The cells of a row, from a method's figure groups of a drive; none where it has no such figures.
+Values = Callable[[Mapping[str, Any]], list[float | None]]
+
+_BOUNDARIES = ("ego P", "ego R", "ego F1", "px", "all P", "all R", "all F1")
+
+
+def tables(figures: Mapping[str, Any]) -> Iterator[Table]:
+    """A table for each level: a part for each drive, a row for each method."""
+    images, clips = figures["images"], figures["clips"]
+    names = ("base rate", "P", "R", "Acc", "AP", "ego prop.", "all prop.")
+    yield _table("A. Candidates: false beyond 40 px; proposed among the first 16", names, images, _candidates)
+    yield _table("B. Single images: boundaries, error in px at 640 wide", _BOUNDARIES, images, _on_images)
+    if any(clips.values()):
+        yield _table("B. Clips with the tracker", _BOUNDARIES, clips, lambda groups: _boundaries(groups["tracked"]))
+        yield _table("B. Clips frame by frame", _BOUNDARIES, clips, lambda groups: _boundaries(groups["alone"]))
+    yield _table("C. The field's metrics", ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5"), images, _field)
+
+
+def _candidates(groups: Mapping[str, Any]) -> list[float | None]:
+    if "candidates" not in groups:
+        return []
+    part, proposed = groups["candidates"]["far_40"], groups["candidates"]["proposal_recall"]
+    shares = [part[key] for key in ("base_rate", "precision", "recall", "accuracy", "average_precision")]
+    return [*shares, *(proposed[which]["recall_16"] for which in ("ego", "all"))]
+
+
+def _on_images(groups: Mapping[str, Any]) -> list[float | None]:
+    return _boundaries(groups["boundaries"])
+
+
+def _boundaries(part: Mapping[str, Any]) -> list[float | None]:
+    pair = [part["ego"][key] for key in ("precision", "recall", "f1", "mean_error_px_640")]
+    return [*pair, *(part["all"][key] for key in ("precision", "recall", "f1"))]
+
+
+def _field(groups: Mapping[str, Any]) -> list[float | None]:
+    tusimple, culane = groups["field"]["tusimple"], groups["field"]["culane"]
+    return [tusimple["accuracy"], tusimple["fp"], tusimple["fn"], culane["f1"]]
+
+
+def _table(title: str, columns: Sequence[str], methods: Mapping[str, Any], values: Values) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for drive in next(iter(methods.values())):
+        rows = [(method, values(drives[drive])) for method, drives in methods.items()]
+        if any(row for _, row in rows):
+            table.add_row(Text(drive, style="bold"))
+        for method, row in rows:
+            if row:
+                table.add_row(Text(f" {method}"), *map(_share, row))
+    return table
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
