@@ -14,9 +14,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lanestream_exporter.training.classifier import ClassifierTask, starting_network
 from lanestream_exporter.training.config import SHIPPED, ClassifierConfig, TrainConfig, read_config
 from lanestream_exporter.training.device import best_device, described
+from lanestream_exporter.training.framesources import frame_sources
 from lanestream_exporter.training.loop import Progress as Learnt
 from lanestream_exporter.training.loop import Run, Task
-from lanestream_exporter.training.sources import origin_of, patch_files, remember_files
+from lanestream_exporter.training.patchfiles import remember_files
+from lanestream_exporter.training.regressor import RegressorConfig, RegressorTask, starting_regressor
+from lanestream_exporter.training.sources import origin_of, patch_files
 
 _INTERRUPTED = 130
 
@@ -52,6 +55,25 @@ def classifier(config: Path, folder: Path, data: Path | None, patches: Path | No
     for source in sources:
         click.echo(f"{source.name}: {len(source.train)} patches to train on, {len(source.check)} to validate with")
     _learn(ClassifierTask(settings, network, sources, origin_of(settings.data)), settings, folder)
+
+
+@train.command()
+@click.argument("config", type=click.Path(path_type=Path), default=Path("regressor"))
+@_RUN
+@_DATA
+@click.option("--frames", type=click.Path(path_type=Path), help="Folder that keeps the scenes [default: in the run].")
+def regressor(config: Path, folder: Path, data: Path | None, frames: Path | None) -> None:
+    """Train the regressor as CONFIG says: a TOML file, or the name of a shipped one.
+
+    Renders scenes, and moves them and the real frames as other cameras and roads would show them.
+    """
+    settings = read_config(config, RegressorConfig)
+    network = starting_regressor(settings)
+    with _bar("rendering") as advance:
+        sources, origin = frame_sources(settings.data, frames or folder / "frames", data, advance)
+    for source in sources:
+        click.echo(f"{source.name}: {len(source.train)} frames to train on, {len(source.check)} to validate with")
+    _learn(RegressorTask(settings, network, sources, origin), settings, folder)
 
 
 @train.command()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,41 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lanestream.errors import CheckpointError, LabelError
+from lanestream.errors import CheckpointError
 from lanestream_exporter.alexnet import AlexNet, initialise, load_state, normalise
 from lanestream_exporter.augment import augmented
 from lanestream_exporter.patchstore import PatchStore
 from lanestream_exporter.training.config import ClassifierConfig
 from lanestream_exporter.training.loop import CHOOSES, Batch
+from lanestream_exporter.training.patchfiles import PatchSource
 from lanestream_exporter.training.scores import scores
-
-
-@dataclass(frozen=True)
-class PatchSource:
-    """Patches of one kind, `rendered` or `real`: those to train on, and those that choose the best network.
-
-    Raises LabelError where either lacks true or false patches.
-    """
-
-    name: str
-    train: PatchStore
-    check: PatchStore
-
-    def __post_init__(self) -> None:
-        for store, use in ((self.train, "train on"), (self.check, "validate with")):
-            for label, verdict in ((1, "true"), (0, "false")):
-                if not (store.labels == label).any():
-                    raise LabelError(f"there are no {verdict} {self.name} patches to {use}", "give more frames")
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many patches there are, and how many of them are true."""
-        return {
-            "train": len(self.train),
-            "train_true": int(self.train.labels.sum()),
-            "check": len(self.check),
-            "check_true": int(self.check.labels.sum()),
-        }
 
 
 class ClassifierTask:

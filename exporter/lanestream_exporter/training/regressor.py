@@ -92,7 +92,7 @@ class RegressorTask:
         return lateral_loss(Answer.of(raw.float()), _named(targets))
 
     def check(self, network: nn.Module) -> dict[str, float]:
-        """The loss of each source, and of real frames the lateral error in pixels at 640 wide; the mean loss chooses."""
+        """Loss and lateral error of each source, in pixels at 640 wide; the mean loss chooses."""
         losses, figures = [], {}
         for name, (canvases, *targets) in self._checks.items():
             parts = [network(_prepared(canvases[i : i + 50])) for i in range(0, len(canvases), 50)]
