@@ -8,12 +8,15 @@ import click
 
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.export import ExportReport, ExportSettings, export_classifier
-from lanestream_exporter.patchstore import read_stores
+from lanestream_exporter.patchstore import PatchStore, read_stores
 from lanestream_exporter.rendering import real_store
 from lanestream_exporter.training.checkpoints import read_checkpoint
+from lanestream_exporter.training.patchfiles import patches_of_run
 
 _DATA = click.option(
-    "--data", type=click.Path(path_type=Path), help="Folder of real frames [default: $LANESTREAM_DATA]."
+    "--data",
+    type=click.Path(path_type=Path),
+    help="Folder of real frames [default: the patches of the run, else $LANESTREAM_DATA].",
 )
 
 
@@ -27,14 +30,20 @@ _DATA = click.option(
 )  # fmt: skip
 @_DATA
 def export(checkpoint: Path, out: Path, precision: str, rank_energy: float, data: Path | None) -> None:
-    """Write CHECKPOINT as the ONNX file OUT that serves, after proving that it does the same."""
-    root = data_root(data)
+    """Write CHECKPOINT as the ONNX file OUT that serves, after proving that it does the same.
+
+    It is calibrated and proved on the patches of its run, or on those of the real frames in --data.
+    """
     read_checkpoint(checkpoint)  # what is no checkpoint is told now, not after the patches have been made
-    folder = checkpoint.parent / "patches"
-    train_patches = read_stores([real_store(folder, root, "train")])
-    check = read_stores([real_store(folder, root, "val")])
+    patches = None if data is not None else patches_of_run(checkpoint.parent)
+    train_patches, check = patches or _real_patches(checkpoint.parent / "patches", data_root(data))
     settings = ExportSettings(precision="fp32" if precision == "fp32" else "int8", rank_energy=rank_energy)
     _tell(export_classifier(checkpoint, out, settings, train_patches, check))
+
+
+def _real_patches(folder: Path, root: Path) -> tuple[PatchStore, PatchStore]:
+    train, check = (read_stores([real_store(folder, root, split)]) for split in ("train", "val"))
+    return train, check
 
 
 def _tell(report: ExportReport) -> None:
