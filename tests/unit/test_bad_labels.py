@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from labelfiles import (
     HEIGHT,
     LEFT,
@@ -34,6 +37,7 @@ from labelfiles import (
 )
 
 from lanestream.errors import LabelError
+from lanestream_exporter.datasets.checking import Check
 from lanestream_exporter.datasets.polylines import sound
 from lanestream_exporter.datasets.reading import Sample, survey
 
@@ -225,8 +229,20 @@ def test_a_labelled_frame_beyond_the_videos_end_is_named(tmp_path: Path, clip: P
     records = [clip_record([], lanes=[], clip="drive.mp4", frame=index) for index in (9, 1, -1)]
     write_lines(tmp_path / "drive.jsonl", *records)
     before, beyond = faults(tmp_path)
-    assert "drive.jsonl:3: frame -1 is before the first one" in before
+    assert "drive.jsonl:3: drive.mp4#-1: frame -1 is before the first one" in before
     assert "drive.jsonl:1: drive.mp4#9: frame 9 is labelled, but drive.mp4 has 3 frames" in beyond
+
+
+def test_bad_tracks_are_named(tmp_path: Path, clip: Path) -> None:
+    track = f'<track id="2">{polyline(LEFT, frame=0)}{polyline(LEFT)}</track>'
+    write_cvat(tmp_path / "annotations.xml", track, meta="<source>drive.mp4</source>")
+    told = faults(tmp_path)
+    assert "annotations.xml: track 2: there is no 'frame'" in told[0]
+    assert "annotations.xml: there is no file drive.mp4" in told[1]
+    shutil.copy(clip / "drive.mp4", tmp_path)
+    size = "<original_size><width>x</width><height>2</height></original_size>"
+    write_cvat(tmp_path / "annotations.xml", track, meta=f"<task><source>drive.mp4</source>{size}</task>")
+    assert "annotations.xml: invalid literal" in faults(tmp_path)[1]
 
 
 def test_bad_masks_are_named(tmp_path: Path, draw: Draw) -> None:
@@ -245,6 +261,48 @@ def test_bad_masks_are_named(tmp_path: Path, draw: Draw) -> None:
         "e_mask.png: there is no file e.jpg",
     ]
     assert all(word in line for word, line in zip(words, faults(tmp_path), strict=True))
+
+
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.just(10**400),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["points", "flags", "a"]), inner),
+    max_leaves=6,
+)
+_SOUND: dict[str, dict[str, Any]] = {
+    "tusimple": tusimple_record("a.jpg", [1, 2, 3]) | {"source": "clips/a/1/2.jpg"},
+    "labelme": {
+        "shapes": [strip(LEFT)],
+        "imagePath": "a.jpg",
+        "imageWidth": WIDTH,
+        "imageHeight": 180,
+        "imageData": "",
+    },
+    "clips": clip_record(clip="b.mp4", image="a.jpg"),
+}
+
+
+def _paths(record: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Each field, and each field of the first lane."""
+    nested = next((key for key in ("lanes", "shapes") if key in record and isinstance(record[key][0], dict)), None)
+    return [(key,) for key in record] + [(nested, key) for key in (record[nested][0] if nested else ())]
+
+
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(data=st.data())
+def test_no_record_raises_anything_else(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    folder = tmp_path_factory.mktemp("fuzzed")
+    drawer(folder)("a.jpg")
+    form = data.draw(st.sampled_from(sorted(_SOUND)))
+    record = deepcopy(_SOUND[form])
+    field = data.draw(st.sampled_from(_paths(record)))
+    place = record if len(field) == 1 else record[field[0]][0]
+    place[field[-1]] = data.draw(_JSON)
+    (folder / ("labels.jsonl" if form == "clips" else "labels.json")).write_text(json.dumps(record))
+    check = Check()
+    for found in survey(folder, form):
+        check.add(found)
+    assert len(check.faults) + check.contents.groups.total() >= 1
+    assert check.contents.lines()
 
 
 def test_small_slips_of_a_hand_are_smoothed() -> None:

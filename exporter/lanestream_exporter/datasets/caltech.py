@@ -48,7 +48,7 @@ def caltech_entries(folder: DataFolder) -> Entries:
             place = f"{path}: frame {number}"
             try:
                 yield _entry(frame, place, path, folder)
-            except (ValueError, TypeError, AttributeError, KeyError) as error:
+            except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
                 yield LabelError(f"{place}: {error}", "a frame needs a frame and labels with points and a type")
             except LabelError as error:
                 yield placed(place, error)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
 
 from lanestream.errors import LabelError, SourceError
 from lanestream.lanes import Image
-from lanestream_exporter.datasets.entries import Entries, Entry, numbered
+from lanestream_exporter.datasets.entries import Entries, Entry, numbered, size_of
 from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 from lanestream_exporter.datasets.pictures import Picture
@@ -19,6 +19,8 @@ from lanestream_exporter.datasets.polylines import points_of
 from lanestream_exporter.datasets.records import all_records, placed, records, unusable
 
 _NEEDED = "frame, width, height and lanes"
+# What a lane may say of itself, in the order of LabelledLane's fields.
+_TOLD: Final[Mapping[str, type]] = {"id": int, "position": int, "type": str, "color": str}
 
 
 def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, LabelledFrame]:
@@ -30,7 +32,7 @@ def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, Labelled
     for place, record in records(path):
         try:
             frames[int(record["frame"])] = _frame(record, path, exhaustive)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise unusable(place, error, _NEEDED) from error
     return frames
 
@@ -48,7 +50,16 @@ def _lanes(record: dict[str, Any]) -> Iterator[LabelledLane]:
             points = points_of(lane["points"])
         except ValueError as error:
             raise ValueError(f"lane {number}: {error}") from None
-        yield LabelledLane(points, lane.get("id"), lane.get("position"), lane.get("type"), lane.get("color"))
+        told = (_told(lane, name, kind) for name, kind in _TOLD.items())
+        yield LabelledLane(points, *told)
+
+
+def _told(lane: dict[str, Any], name: str, kind: type) -> Any:
+    """What a lane says of itself under `name`, or None. Raises ValueError where it is of another kind."""
+    value = lane.get(name)
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(f"its {name} {value!r} is of the wrong kind")
+    return value
 
 
 def read_clip(video: Path, labels: Path) -> Iterator[tuple[LabelledFrame, Image]]:
@@ -84,7 +95,7 @@ def _file_entries(path: Path, folder: DataFolder) -> Entries:
             continue
         try:
             yield _entry(record, place, path, folder)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, AttributeError) as error:
             yield unusable(place, error, _NEEDED)
         except LabelError as error:
             yield placed(place, error)
@@ -95,7 +106,7 @@ def _frame_index(found: Entry | LabelError) -> int:
 
 
 def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -> Entry:
-    size = int(record["width"]), int(record["height"])
+    size = size_of(record["width"], record["height"])
     lanes = numbered(_lanes(record))
     clip = relative(record.get("clip") or f"{path.stem}.mp4")
     if "image" in record:
@@ -103,8 +114,6 @@ def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -
         group = clip.stem if "clip" in record else drive_of(image.parent)
         return Entry(place, folder.name(image), group, Picture(image), lanes, size)
     index = int(record["frame"])
-    if index < 0:
-        raise ValueError(f"frame {index} is before the first one")
     root = folder.root
     video = folder.find(path.parent / clip, root / "clips" / clip, root / "videos" / clip, root / clip)
     return Entry(place, f"{video.name}#{index}", clip.stem, Picture(video, index), lanes, size)

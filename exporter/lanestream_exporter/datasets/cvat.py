@@ -17,7 +17,7 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import parse
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import Entries, Entry, colour_in, kind_in, numbered
+from lanestream_exporter.datasets.entries import Entries, Entry, colour_in, kind_in, numbered, size_of
 from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
 from lanestream_exporter.datasets.labels import LabelledLane
 from lanestream_exporter.datasets.pictures import Picture
@@ -44,7 +44,7 @@ def cvat_entries(folder: DataFolder) -> Entries:
             place = f"{path}: image {image.get('name')}"
             try:
                 yield _image_entry(image, place, _Export(path, root, folder))
-            except (ValueError, KeyError, TypeError) as error:
+            except (ValueError, KeyError, TypeError, OverflowError) as error:
                 yield unusable(place, error, "name, width and height, and a polyline points")
             except LabelError as error:
                 yield placed(place, error)
@@ -93,7 +93,7 @@ def _image_entry(image: Element, place: str, export: _Export) -> Entry:
             others.append(shape.tag)
     task = export.text(f"meta/project/tasks/task[id='{int(image.get('task_id', 0))}']/name", "meta/task/name")
     group = drive_of(found.parent) if len(name.parts) > 1 or not task else f"task {task}"
-    size = int(image.attrib["width"]), int(image.attrib["height"])
+    size = size_of(image.attrib["width"], image.attrib["height"])
     source = export.folder.name(found)
     return Entry(place, source, group, Picture(found), numbered(lanes, "polyline"), size, others=tuple(others))
 
@@ -130,6 +130,9 @@ def _track_entries(export: _Export) -> Entries:
         return
     try:
         pictures = _Pictures.of(export)
+    except ValueError as error:
+        yield unusable(str(export.path), error, "an original_size of whole numbers")
+        return
     except LabelError as error:
         yield placed(str(export.path), error)
         return
@@ -143,7 +146,10 @@ def _track_entries(export: _Export) -> Entries:
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Where the frames of a video task are: in the video, or as images that were exported beside the labels."""
+    """Where the frames of a video task are: in the video, or as images that were exported beside the labels.
+
+    Without a folder `images` beside the labels, the video is looked for there and in the folder `clips`.
+    """
 
     export: _Export
     video: Path | None
@@ -160,8 +166,7 @@ class _Pictures:
         video = None
         if not (base / "images").is_dir():
             video = folder.find(base / source, folder.root / source, folder.root / "clips" / source)
-        known = (int(size[0]), int(size[1])) if size[0].isdecimal() and size[1].isdecimal() else None
-        return cls(export, video, source.stem, known)
+        return cls(export, video, source.stem, size_of(*size) if all(size) else None)
 
     def entry(self, index: int, place: str, lanes: dict[str, LabelledLane]) -> Entry:
         """The entry of a frame. Raises LabelError where its image is missing."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.folder import DataFolder
@@ -19,6 +19,7 @@ _KINDS: Final[Mapping[str, str]] = {
     "curb": "edge",
     "kerb": "edge",
 }
+_LONGEST_SIDE: Final = 1 << 20  # pixels
 _COLOURS: Final = frozenset({"white", "yellow", "blue", "red", "orange"})
 
 
@@ -58,3 +59,11 @@ def kind_in(words: Iterable[str]) -> str | None:
 def colour_in(words: Iterable[str]) -> str | None:
     """The colour that one of `words` names."""
     return next((word for word in words if word in _COLOURS), None)
+
+
+def size_of(width: Any, height: Any) -> tuple[int, int]:
+    """A picture's size as labels tell it. Raises ValueError or TypeError where it is none."""
+    size = int(width), int(height)
+    if not all(0 < side < _LONGEST_SIDE for side in size):
+        raise ValueError(f"{str(width)[:12]} x {str(height)[:12]} is no size of a picture")
+    return size

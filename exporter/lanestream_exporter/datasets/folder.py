@@ -11,6 +11,7 @@ from lanestream.errors import LabelError
 
 # Where labels commonly stand beside their pictures rather than above them.
 _LABEL_FOLDERS: Final = frozenset({"labels", "annotations", "json"})
+IMAGE_FOLDERS: Final = ("images", "image", "imgs", "img", "frames")
 _PICTURES: Final = (".jpg", ".jpeg", ".png", ".webp")
 
 
@@ -65,8 +66,11 @@ class DataFolder:
 
 
 def drive_of(folder: Path) -> str:
-    """The name of the drive or clip whose frames are in `folder`: its last two parts, from wherever it is looked at."""
-    return "/".join(_plain(folder).parts[-2:])
+    """The name of the drive or clip whose frames are in `folder`, the same from wherever it is looked at.
+
+    It is the folder's last two parts, without those that only say that pictures are in it.
+    """
+    return "/".join([part for part in _plain(folder).parts if part not in IMAGE_FOLDERS][-2:])
 
 
 def relative(name: str) -> Path:

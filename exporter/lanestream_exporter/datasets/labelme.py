@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import Entries, Entry, colour_in, kind_in
+from lanestream_exporter.datasets.entries import Entries, Entry, colour_in, kind_in, size_of
 from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
 from lanestream_exporter.datasets.labels import LabelledLane
 from lanestream_exporter.datasets.pictures import Picture
@@ -35,7 +35,7 @@ def labelme_entries(folder: DataFolder) -> Entries:
             continue
         try:
             yield _entry(record, path, folder)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, AttributeError) as error:
             yield unusable(str(path), error, "imagePath and shapes, each with label, shape_type and points")
         except LabelError as error:
             yield placed(str(path), error)
@@ -51,7 +51,7 @@ def _entry(record: dict[str, Any], path: Path, folder: DataFolder) -> Entry:
             others.append(str(form))
     picture = _picture(record, path, folder)
     width, height = record.get("imageWidth"), record.get("imageHeight")
-    size = (int(width), int(height)) if width and height else None
+    size = size_of(width, height) if width and height else None
     source = folder.name(picture.path)
     return Entry(str(path), source, drive_of(picture.path.parent), picture, lanes, size, others=tuple(others))
 

@@ -22,13 +22,12 @@ from scipy.ndimage import binary_fill_holes
 from lanestream.errors import ImageError, LabelError
 from lanestream.lanes import FloatArray
 from lanestream_exporter.datasets.entries import Entries, Entry
-from lanestream_exporter.datasets.folder import DataFolder, drive_of
+from lanestream_exporter.datasets.folder import IMAGE_FOLDERS, DataFolder, drive_of
 from lanestream_exporter.datasets.labels import LabelledLane
 from lanestream_exporter.datasets.pictures import Picture, checked_header, file_bytes
 from lanestream_exporter.datasets.records import placed
 
 _MASK_FOLDERS: Final = frozenset({"mask", "masks", "segmentation"})
-_IMAGE_FOLDERS: Final = ("images", "image", "imgs", "frames")
 _BESIDE: Final = "_mask"
 _MOST_INSTANCES: Final = 32
 _LEAST_ROWS: Final = 3  # fewer are a speck
@@ -59,7 +58,7 @@ def _image_of(mask: Path, folder: DataFolder) -> Path:
         return folder.picture_of(mask.with_name(mask.stem[: -len(_BESIDE)]))
     parts = mask.absolute().with_suffix("").parts
     at = max(number for number, part in enumerate(parts[:-1]) if part in _MASK_FOLDERS)
-    for name in _IMAGE_FOLDERS:
+    for name in IMAGE_FOLDERS:
         if Path(*parts[:at], name).is_dir():
             return folder.picture_of(Path(*parts[:at], name, *parts[at + 1 :]))
     raise LabelError("there is no folder images beside its own", "masks/NAME.png belongs to images/NAME.jpg")

@@ -47,6 +47,8 @@ class Opener:
         return decode(picture.data if picture.data is not None else file_bytes(picture.path), LIMITS)
 
     def _frame(self, video: Path, index: int) -> Image:
+        if index < 0:
+            raise SourceError(f"frame {index} is before the first one")
         if video != self._video or index < self._read:
             self._capture.release()
             self._video, self._read = video, 0
@@ -56,7 +58,10 @@ class Opener:
             if not self._capture.grab():
                 raise SourceError(f"frame {index} is labelled, but {video.name} has {self._read} frames")
             self._read += 1
-        return np.asarray(self._capture.retrieve()[1], dtype=np.uint8)
+        decoded, image = self._capture.retrieve()
+        if not decoded:
+            raise SourceError(f"frame {index} of {video.name} can't be decoded")
+        return np.asarray(image, dtype=np.uint8)
 
 
 def file_bytes(path: Path) -> bytes:

@@ -35,7 +35,7 @@ def read_tusimple(root: Path, split: str | None = None) -> Iterator[tuple[Labell
             if split is not None and record["split"] != split:
                 continue
             lanes, source = tuple(_lanes(record)), str(record["raw_file"])
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise unusable(place, error, f"split, {_NEEDED}") from error
         image = cv2.imread(str(root / source))
         if image is None:
@@ -52,7 +52,7 @@ def tusimple_entries(folder: DataFolder) -> Entries:
                 continue
             try:
                 yield _entry(record, place, path, folder)
-            except (ValueError, KeyError, TypeError) as error:
+            except (ValueError, KeyError, TypeError, OverflowError) as error:
                 yield unusable(place, error, _NEEDED)
             except LabelError as error:
                 yield placed(place, error)
@@ -63,7 +63,7 @@ def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -
     lanes = numbered(_lanes(record))
     image = folder.find(path.parent / name, folder.root / name)
     official = PurePosixPath(str(record.get("source", name.as_posix()))).parts
-    group = f"tusimple {official[1]}" if official[0] == "clips" and len(official) > 3 else drive_of(image.parent)
+    group = f"tusimple {official[1]}" if official[:1] == ("clips",) and len(official) > 3 else drive_of(image.parent)
     return Entry(place, folder.name(image), group, Picture(image), lanes)
 
 
