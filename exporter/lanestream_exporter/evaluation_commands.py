@@ -61,15 +61,15 @@ def evaluate(
     console = Console(soft_wrap=True)
     for table in tables(figures):
         console.print(table)
-    if json_path is not None:
-        with _writing(json_path):
-            json_path.parent.mkdir(parents=True, exist_ok=True)
-            json_path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if out is not None:
         with needs_extra("train"), _writing(out):
             from lanestream_exporter.evaluation.report import write_report
 
             click.echo(f"report: {write_report(out, evaluation, figures)}")
+    if json_path is not None:
+        with _writing(json_path):
+            json_path.parent.mkdir(parents=True, exist_ok=True)
+            json_path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 
 
 @click.command()
