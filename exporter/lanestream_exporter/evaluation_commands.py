@@ -13,8 +13,9 @@ from rich.console import Console
 
 from lanestream.engine import SHIPPED_MODEL, load_engine
 from lanestream.errors import LabelError, ModelError, SourceError, needs_extra
+from lanestream_exporter.datasets.folder import DataFolder
 from lanestream_exporter.datasets.formats import FORMATS
-from lanestream_exporter.datasets.reading import read_dataset
+from lanestream_exporter.datasets.reading import form_of, read_dataset
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.evaluation.measuring import Material
 from lanestream_exporter.evaluation.measuring import evaluate as measure
@@ -87,7 +88,8 @@ def _material(data: Path | None, form: str, split: Split) -> Material:
     if form == "auto":
         with suppress(LabelError):
             return Material.of_split(data_root(data), split)
-    return Material(data.name, lambda: read_dataset(data, form))
+    told = form_of(DataFolder.at(data), form)
+    return Material(data.name, lambda: read_dataset(data, told))
 
 
 @contextmanager

@@ -70,7 +70,7 @@ def folder(tmp_path: Path) -> Path:
         ("score empty.jsonl text", "text:1: not JSON"),
         ("score empty.jsonl binary", "binary is not a text file"),
         ("score empty.jsonl half.jsonl", "half.jsonl:1: there is no 'lanes'"),
-        ("evaluate --data none", "no labelled frames in none"),
+        ("evaluate --data none", "no labels that are known in none"),
         ("train classifier --run run --data none", "no labelled frames in none"),
         ("train classifier --run run --data broken", "labels.jsonl:1: there is no"),
         ("train classifier initial.toml --run run --data broken", "text is not a PyTorch checkpoint"),
