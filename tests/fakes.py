@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Findings, Prepared
+from lanestream.detection import Findings, Pipeline, Prepared
 from lanestream.engine import Engine
 from lanestream.geometry import RoadView, visible_rows
 from lanestream.lanes import Curve, Detection, Image
@@ -73,7 +73,7 @@ class GatedNetwork(FakeNetwork):
 
 def engine(network: FakeNetwork | None = None) -> Engine:
     """An engine of fakes."""
-    return Engine(FakeDetector(), network or FakeNetwork())
+    return Engine([Pipeline("candidates", FakeDetector(), network or FakeNetwork())])
 
 
 def image_file(kind: str = ".jpg", width: int = 320, height: int = 180, shade: int | None = None) -> bytes:

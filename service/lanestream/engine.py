@@ -1,42 +1,67 @@
-"""The whole way of a frame in one place: a detector, its network, and the steps between image and result."""
+"""The whole way of a frame in one place: detectors, their networks, and the steps between image and result."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
-from lanestream.detection import LaneDetector, Network
+from lanestream.detection import DetectorName, LaneDetector, Network, Pipeline
 from lanestream.detection.detector import CandidateDetector
+from lanestream.detection.prior import RoadGlance
 from lanestream.detection.regression import RegressionDetector
 from lanestream.detection.strips import StripCutter
+from lanestream.errors import ModelError, NoDetectorError
 from lanestream.geometry import CanvasGeometry, StripGeometry
-from lanestream.inference import ModelInfo, OnnxModel, RegressorInfo
+from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
 from lanestream.inference.providers import Provider
 from lanestream.lanes import FrameResult, Image
 from lanestream.sessions import Session
 
-# The network that is shipped and served where no other is named.
-SHIPPED_MODEL = Path(__file__).parent / "models" / "classifier.onnx"
+# The networks that are shipped, and served where no others are named.
+SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
+SHIPPED_REGRESSOR: Final = Path(__file__).parent / "models" / "regressor.onnx"
 
 
 class Engine:
-    """A loaded network and its detector, shared by all sessions of a process."""
+    """Detectors with their loaded networks, shared by all sessions of a process; the first one is the default."""
 
-    def __init__(self, detector: LaneDetector, network: Network) -> None:
-        self.detector = detector
-        self.network = network
+    def __init__(self, pipelines: Sequence[Pipeline]) -> None:
+        self.pipelines = tuple(pipelines)
 
-    def open_session(self, horizon: float | None = None) -> Session:
-        """A session for one camera; `horizon` is its row as a share of the image height, estimated where None."""
-        return Session(self.detector, horizon)
+    @property
+    def detector(self) -> LaneDetector:
+        """The default detector."""
+        return self.pipelines[0].detector
+
+    @property
+    def network(self) -> Network:
+        """The default detector's network."""
+        return self.pipelines[0].network
+
+    def pipeline(self, name: DetectorName | None = None) -> Pipeline:
+        """The pipeline of that name, the default one where None. Raises NoDetectorError where it is not loaded."""
+        for pipeline in self.pipelines:
+            if name in (None, pipeline.name):
+                return pipeline
+        names = ", ".join(pipeline.name for pipeline in self.pipelines)
+        raise NoDetectorError(f"there is no detector {name} here", f"ask for {names}")
+
+    def open_session(self, horizon: float | None = None, detector: DetectorName | None = None) -> Session:
+        """A session for one camera; `horizon` is its row as a share of the image height, estimated where None.
+
+        Raises NoDetectorError where `detector` is not loaded.
+        """
+        return Session(self.pipeline(detector), horizon)
 
     def process(self, session: Session, image: Image, timestamp: float) -> FrameResult:
         """One frame from image to lanes, in the calling thread, with the milliseconds of each stage."""
         started = time.perf_counter()
         prepared = session.prepare(image)
         proposed = time.perf_counter()
-        outputs = self.network.run(prepared.inputs)
+        outputs = session.network.run(prepared.inputs)
         inferred = time.perf_counter()
         result = session.conclude(prepared, outputs, timestamp)
         tracked = time.perf_counter()
@@ -48,21 +73,44 @@ class Engine:
         return replace(result, timing_ms=timing)
 
 
-def load_engine(model: Path | None = None, provider: Provider = "auto") -> Engine:
-    """The engine for the model file at `model`, the shipped one where None, warmed up.
+def load_engine(model: Path | None = None, provider: Provider = "auto", regressor: Path | None = None) -> Engine:
+    """The engine for the model file at `model`, the shipped classifier where None, warmed up.
 
-    Raises ModelError for a file that can't be served, ProviderError where `provider` can't be had.
+    A classifier is helped by the `regressor`, which tells it where to look and is a detector of its own; None goes
+    without. A regressor as the `model` is the only detector. Raises ModelError for a file that can't be served,
+    ProviderError where `provider` can't be had.
     """
-    network = OnnxModel.load(model or SHIPPED_MODEL, provider)
+    network = _warm(model or SHIPPED_MODEL, provider)
+    if isinstance(network.info, RegressorInfo):
+        return Engine([Pipeline("regression", _regression(network.info), network)])
+    if regressor is None:
+        return Engine([Pipeline("candidates", _candidates(network.info, None), network)])
+    other = _warm(regressor, provider)
+    if not isinstance(other.info, RegressorInfo):
+        raise ModelError(f"{regressor} is a {other.info.kind}, not a regressor", "give a regressor, or `none`")
+    glance = RoadGlance(_regression(other.info), other)
+    return Engine(
+        [
+            Pipeline("candidates", _candidates(network.info, glance), network),
+            Pipeline("regression", glance.detector, other),
+        ]
+    )
+
+
+def _warm(path: Path, provider: Provider) -> OnnxModel:
+    network = OnnxModel.load(path, provider)
     network.warm_up()
-    return Engine(_detector(network.info), network)
+    return network
 
 
-def _detector(info: ModelInfo) -> LaneDetector:
-    """The detector that asks a network the questions it was trained for."""
-    if isinstance(info, RegressorInfo):
-        canvas = info.canvas
-        geometry = CanvasGeometry(canvas.size, canvas.above, canvas.narrowest)
-        return RegressionDetector(info.threshold, geometry, canvas.detail_width)
+def _candidates(info: ClassifierInfo, glance: RoadGlance | None) -> CandidateDetector:
+    """The detector that asks a classifier about the strips it was trained on."""
     strip = StripGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width)
-    return CandidateDetector(info.threshold, cutter=StripCutter(strip))
+    return CandidateDetector(info.threshold, glance, cutter=StripCutter(strip))
+
+
+def _regression(info: RegressorInfo) -> RegressionDetector:
+    """The detector that shows a regressor the canvases it was trained on."""
+    canvas = info.canvas
+    geometry = CanvasGeometry(canvas.size, canvas.above, canvas.narrowest)
+    return RegressionDetector(info.threshold, geometry, canvas.detail_width)

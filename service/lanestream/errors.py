@@ -58,6 +58,12 @@ class ProtocolError(LanestreamError):
     code = "bad_message"
 
 
+class NoDetectorError(LanestreamError):
+    """A detector was asked for whose network this process has not loaded."""
+
+    code = "no_detector"
+
+
 class OverrunError(LanestreamError):
     """A client sent more frames than it was granted in mode `all`."""
 

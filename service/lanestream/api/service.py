@@ -56,7 +56,7 @@ class Service:
 
     def install(self, engine: Engine) -> None:
         """Makes the service ready with a warm engine."""
-        runner = FrameRunner(engine.network, self.settings.image_limits, self.settings.threads)
+        runner = FrameRunner(self.settings.image_limits, self.settings.threads)
         self._loaded = Loaded(engine, runner)
 
     async def close(self) -> None:

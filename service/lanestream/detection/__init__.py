@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve, Detection, Image
+
+DetectorName = Literal["candidates", "regression"]
 
 
 @dataclass(frozen=True)
@@ -85,3 +87,12 @@ class Network(Protocol):
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Outputs (N, classes) for inputs (N, H, W, 3) in RGB; N may be 0."""
         ...
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A detector with the network that answers it, by the name that users ask for it."""
+
+    name: DetectorName
+    detector: LaneDetector
+    network: Network

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from lanestream.detection.edges import WORKING_WIDTH, find_edges, paint_grey, resized
 from lanestream.detection.fan import Fan
 from lanestream.detection.hough import ExtendedHough, HoughLines
+from lanestream.detection.lattice import Lattice
 from lanestream.detection.perspective import Perspective, PerspectiveSearch, find_ridges
+from lanestream.detection.prior import RoadPrior
 from lanestream.detection.vanishing import VanishingPointSearch
 from lanestream.geometry import RoadView, Scaling, visible_rows
 from lanestream.lanes import Candidate, Curve, Image
@@ -42,11 +44,15 @@ class Proposals:
 
 @dataclass(frozen=True)
 class _Line:
-    """A line of the working image by its columns at the near and the far row."""
+    """A line of the working image by its columns at the near and the far row.
+
+    `curve` is its curve in image pixels where that is known better than by the two columns.
+    """
 
     near: float
     far: float
     strength: float
+    curve: Curve | None = None
 
 
 @dataclass(frozen=True)
@@ -67,22 +73,41 @@ class CandidateSearch:
     most_width: float = 0.4
     separation: float = 0.05
 
-    def propose(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Proposals:
+    def propose(
+        self,
+        image: Image,
+        horizon: float | None = None,
+        expected: Sequence[Curve] = (),
+        prior: RoadPrior | None = None,
+    ) -> Proposals:
         """The candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where that is known.
 
         `expected` are boundaries that the last frames had. They are candidates before all others: what is still there
-        need not be found anew.
+        need not be found anew. A `prior` that saw a boundary gives the perspective, candidates of its own, those of
+        the next lanes, and an order for the rest; one that saw none is as good as none.
         """
         height, width = image.shape[:2]
         scaling = Scaling(WORKING_WIDTH / width)
         grey = resized(paint_grey(image), scaling)
-        point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon))
+        if prior is not None and prior.curves:
+            point = _perspective(prior, scaling, grey.shape[0])
+            lines = self._edges_and_lines(grey, point.y)
+        else:
+            point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon))
         view = RoadView(grey.shape[1], grey.shape[0], point.y)
         image_view = RoadView(width, height, scaling.to_image(point.y))
-        known = [_line(scaling.curve_to_working(curve), view) for curve in expected]
-        new = self._suppress(self._ranked(grey, view, point, lines), known, view)
-        curves = [(line, scaling.curve_to_image(_curve(line, view, point))) for line in new]
-        found = [_candidate(line, curve, image_view) for line, curve in [*zip(known, expected, strict=True), *curves]]
+        ranked = self._ranked(grey, view, point, lines)
+        known = self._suppress([_known(curve, scaling, view) for curve in expected], [], view)
+        if prior is not None and prior.curves:
+            lattice = _lattice(prior, scaling, view, point)
+            ranked = sorted((_trusted(line, lattice, view, point) for line in ranked), key=lambda line: -line.strength)
+            seen = [_known(curve, scaling, view) for curve in prior.curves]
+            known += self._suppress([*seen, *_neighbours(lattice, view, point)], known, view)
+        new = self._suppress(ranked, known, view)
+        found = [
+            _candidate(line, line.curve or scaling.curve_to_image(_curve(line, view, point)), image_view)
+            for line in [*known, *new]
+        ]
         candidates = [candidate for candidate in found if candidate is not None]
         return Proposals(tuple(candidates[: self.limit]), image_view, point.weight)
 
@@ -92,12 +117,17 @@ class CandidateSearch:
         lowest = LOWEST_HORIZON * height
         horizon = None if horizon is None else min(horizon, lowest)
         top = int(horizon) if horizon is not None else int(0.42 * height)
-        lines = self.hough.lines(find_edges(grey, int(np.clip(top, 0, height - 16))), width, height - 1.0)
+        lines = self._edges_and_lines(grey, top)
         first = self.vanishing.find(lines, width, height, horizon)
         guess = Perspective(first.x, first.y, 0.0, first.weight)
         ridges = find_ridges(grey, guess.y)
         point = self.perspective.refine(guess, ridges, width, height - 1.0, horizon is not None)
         return replace(point, y=min(point.y, lowest)), lines
+
+    def _edges_and_lines(self, grey: Image, top: float) -> HoughLines:
+        """The Hough lines of the rows from `top` down."""
+        height, width = grey.shape
+        return self.hough.lines(find_edges(grey, int(np.clip(top, 0, height - 16))), width, height - 1.0)
 
     def _ranked(self, grey: Image, view: RoadView, point: Perspective, lines: HoughLines) -> list[_Line]:
         """Lines of both searches in one order: each list's strengths count against its own strongest."""
@@ -171,10 +201,41 @@ def _normalised(lines: list[_Line]) -> list[_Line]:
     return [replace(line, strength=line.strength / strongest) for line in lines]
 
 
-def _line(curve: Curve, view: RoadView) -> _Line:
-    """A curve of the working image by its columns at the near and the far row."""
-    near, far = curve.x(np.array([view.row_at(_NEAR), view.row_at(_FAR)]))
-    return _Line(float(near), float(far), 1.0)
+def _known(curve: Curve, scaling: Scaling, view: RoadView) -> _Line:
+    """A curve of the image as a line of the working image."""
+    near, far = scaling.curve_to_working(curve).x(np.array([view.row_at(_NEAR), view.row_at(_FAR)]))
+    return _Line(float(near), float(far), 1.0, curve)
+
+
+def _perspective(prior: RoadPrior, scaling: Scaling, height: int) -> Perspective:
+    """What the boundaries of a prior share, in the working image, which is `height` rows high."""
+    curves = [scaling.curve_to_working(curve) for curve in prior.curves]
+    horizon = curves[0].horizon
+    v, k = (float(np.mean([curve.coefficients[i] for curve in curves])) for i in (0, 2))
+    return Perspective(v, horizon, k / (height - 1.0 - horizon) ** 2, 1.0)
+
+
+def _lattice(prior: RoadPrior, scaling: Scaling, view: RoadView, point: Perspective) -> Lattice:
+    sides = (None if c is None else _known(c, scaling, view) for c in (prior.left, prior.right))
+    left, right = (None if line is None else _slope(line, view, point) for line in sides)
+    return Lattice.of(left, right)
+
+
+def _slope(line: _Line, view: RoadView, point: Perspective) -> float:
+    """Where a line crosses the bottom row, from the vanishing point, in depths."""
+    return (line.near - point.x) / view.depth
+
+
+def _trusted(line: _Line, lattice: Lattice, view: RoadView, point: Perspective) -> _Line:
+    return replace(line, strength=line.strength * lattice.trust(_slope(line, view, point)))
+
+
+def _neighbours(lattice: Lattice, view: RoadView, point: Perspective) -> list[_Line]:
+    """Lines where the boundaries of the next lanes should be."""
+    slopes = np.array(lattice.neighbours) - point.bend
+    rows = np.array([view.row_at(_NEAR), view.row_at(_FAR)])
+    near, far = point.columns(slopes, rows, view.bottom)
+    return [_Line(float(n), float(f), 1.0) for n, f in zip(near, far, strict=True)]
 
 
 def _curve(line: _Line, view: RoadView, point: Perspective) -> Curve:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection import Findings, Prepared
 from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
+from lanestream.detection.prior import RoadGlance
 from lanestream.detection.refinement import Refinement
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_rows
@@ -22,12 +23,14 @@ TRUE_LANE = 1
 class CandidateDetector:
     """Finds boundaries by proposing many and letting the classifier choose.
 
-    A candidate is accepted from the probability `threshold` on. Candidates that are nowhere more than `same` times the
-    rows below the horizon apart follow the same marking. Of two boundaries that come nearer than `separation`, or that
-    cross, one is wrong: the more probable one stays.
+    A candidate is accepted from the probability `threshold` on. A `glance` at the whole road tells where to look;
+    without one, edges and ridges alone do. Candidates that are nowhere more than `same` times the rows below the
+    horizon apart follow the same marking. Of two boundaries that come nearer than `separation`, or that cross, one is
+    wrong: the more probable one stays.
     """
 
     threshold: float = 0.5
+    glance: RoadGlance | None = None
     search: CandidateSearch = CandidateSearch()
     cutter: StripCutter = StripCutter()
     refinement: Refinement = Refinement()
@@ -36,7 +39,8 @@ class CandidateDetector:
 
     def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
         """Patches of the candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where known."""
-        proposals = self.search.propose(image, horizon, expected)
+        prior = None if self.glance is None else self.glance.look(image, horizon)
+        proposals = self.search.propose(image, horizon, expected, prior)
         patches = self.cutter.cut(image, proposals.candidates, proposals.view)
         return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from lanestream.detection import Network, Prepared
+    from lanestream.detection import Prepared
     from lanestream.lanes import FrameResult, Image
     from lanestream.sessions.session import Session
 
@@ -45,8 +45,7 @@ class Timed(Generic[T]):
 class FrameRunner:
     """Takes encoded frames to their lanes; the frames of one session one at a time, those of different ones at once."""
 
-    def __init__(self, network: Network, limits: ImageLimits, threads: int) -> None:
-        self._network = network
+    def __init__(self, limits: ImageLimits, threads: int) -> None:
         self._limits = limits
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
         self._inference = ThreadPoolExecutor(1, thread_name_prefix="lanestream-inference")
@@ -58,7 +57,7 @@ class FrameRunner:
         """
         decoded = await self._timed(self._workers, decode, data, self._limits)
         prepared = await self._timed(self._workers, session.prepare, decoded.value)
-        outputs = await self._timed(self._inference, self._network.run, prepared.value.inputs)
+        outputs = await self._timed(self._inference, session.network.run, prepared.value.inputs)
         result = await self._timed(self._workers, session.conclude, prepared.value, outputs.value, timestamp)
         timing = _timing(decoded, prepared, outputs, result, arrived)
         return ProcessedFrame(decoded.value, replace(result.value, timing_ms=timing))

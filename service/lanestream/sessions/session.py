@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Findings, LaneDetector, Prepared
+from lanestream.detection import Findings, Network, Pipeline, Prepared
 from lanestream.lanes import FrameResult, Image
 from lanestream.tracking import LaneTracker
 
@@ -17,11 +17,13 @@ class Session:
     """Follows the lanes of one camera, frame by frame.
 
     `horizon` is its row as a share of the image height where the caller knows it; otherwise it is estimated from the
-    frames and steadied over time. A frame of another size than the last one starts the tracker afresh.
+    frames and steadied over time. A frame of another size than the last one starts the tracker afresh. `network` is
+    what answers between the two halves of a frame.
     """
 
-    def __init__(self, detector: LaneDetector, horizon: float | None = None) -> None:
-        self._detector = detector
+    def __init__(self, pipeline: Pipeline, horizon: float | None = None) -> None:
+        self._detector = pipeline.detector
+        self.network: Network = pipeline.network
         self._configured = horizon
         self._estimate: float | None = None
         self._evidence = 0.0

@@ -1,0 +1,57 @@
+"""Where boundaries are to be expected once the ego lane is known: roads repeat their lanes.
+
+Told in slopes at the bottom row, columns a row from the vanishing point, which on a flat road are metres over camera
+heights: there lanes are equally wide.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+# Lanes are 2.5 to 4.5 m wide and cameras 1 to 2.4 m high; what is usual stands in where one boundary was seen alone.
+_USUAL: Final = 2.4
+_NARROWEST, _WIDEST = 1.2, 4.5
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The ego lane's boundaries as slopes, `left` and `right`, from which others are whole lanes away.
+
+    A line off a place of the lattice by `spread` lane widths counts less, down to `least`; places beyond the next
+    lanes count `outer`.
+    """
+
+    left: float
+    right: float
+    spread: float = 0.12
+    least: float = 0.3
+    outer: float = 0.6
+
+    @classmethod
+    def of(cls, left: float | None, right: float | None) -> Lattice:
+        """The lattice of one or two boundaries; the missing one is a usual lane away."""
+        if left is not None:
+            return cls(left, right if right is not None else left + _USUAL)
+        if right is not None:
+            return cls(right - _USUAL, right)
+        raise ValueError("a lattice needs a boundary")
+
+    @property
+    def width(self) -> float:
+        """The lane width; that of a lane which can't be one is brought to what lanes are."""
+        return min(max(self.right - self.left, _NARROWEST), _WIDEST)
+
+    @property
+    def neighbours(self) -> tuple[float, float]:
+        """The next boundaries out on both sides."""
+        return self.left - self.width, self.right + self.width
+
+    def trust(self, slope: float) -> float:
+        """How likely a line with this slope is a boundary, from 0 to 1, judged by its place alone."""
+        is_left = slope < 0.5 * (self.left + self.right)
+        beyond = (self.left - slope if is_left else slope - self.right) / self.width
+        lanes = max(0, round(beyond))
+        near = math.exp(-0.5 * ((beyond - lanes) / self.spread) ** 2)
+        return (self.least + (1.0 - self.least) * near) * (1.0 if lanes <= 1 else self.outer)

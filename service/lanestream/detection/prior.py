@@ -1,0 +1,56 @@
+"""A glance at the whole road before lines are looked for: where the regressor sees the ego lane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from lanestream.detection import Network
+from lanestream.detection.regression import RegressionDetector, RoadReading
+from lanestream.geometry import RoadView
+from lanestream.lanes import Curve, Image
+
+# A horizon farther than this from where it was taken to be, in depths, is worth a second look at the right place.
+_SECOND_LOOK: Final = 0.06
+
+
+@dataclass(frozen=True)
+class RoadPrior:
+    """What was seen at a glance: the road view with its horizon, and the ego boundaries, None where there is none.
+
+    All in image pixels; the curves share the view's horizon.
+    """
+
+    view: RoadView
+    left: Curve | None
+    right: Curve | None
+
+    @property
+    def curves(self) -> tuple[Curve, ...]:
+        """The boundaries that were seen, left to right."""
+        return tuple(curve for curve in (self.left, self.right) if curve is not None)
+
+
+@dataclass(frozen=True)
+class RoadGlance:
+    """The regressor as a source of priors: `detector` makes its input, `network` answers."""
+
+    detector: RegressionDetector
+    network: Network
+
+    def look(self, image: Image, horizon: float | None = None) -> RoadPrior:
+        """The prior for a BGR image (H, W, 3); `horizon` is about its row, where known."""
+        view, reading = self._reading(image, horizon)
+        if abs(reading.horizon) > _SECOND_LOOK:
+            view, reading = self._reading(image, reading.view(view).horizon)
+        seen = reading.view(view)
+        left, right = (
+            reading.curve(side, seen) if reading.presence[side] >= self.detector.threshold else None for side in (0, 1)
+        )
+        return RoadPrior(seen, left, right)
+
+    def _reading(self, image: Image, horizon: float | None) -> tuple[RoadView, RoadReading]:
+        prepared = self.detector.prepare(image, horizon)
+        return prepared.view, RoadReading.of(np.asarray(self.network.run(prepared.inputs)[0]))
