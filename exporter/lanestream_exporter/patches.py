@@ -128,19 +128,30 @@ class PatchMaker:
                     yield patch, int(verdict)
 
 
-def _shifts(rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Shifts (near, far) in rows below the horizon: one small as a candidate's error, one beyond the true marking."""
-    small = rng.normal(0.0, 0.015, 2)
-    beyond = rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.6)
-    return [(small[0], small[1]), (beyond + small[0], beyond + small[1])]
+@dataclass(frozen=True)
+class _Shift:
+    """How a candidate errs: sideways in rows below the horizon at the bottom and half way up, and in its bend."""
+
+    near: float
+    far: float
+    bend: float
 
 
-def _moved(candidate: Candidate, view: RoadView, shift: tuple[float, float]) -> Candidate:
-    """The candidate moved sideways by `shift` times the rows below the horizon at the bottom and half way up."""
-    near, far = shift[0] * view.depth, shift[1] * 0.5 * view.depth
+def _shifts(rng: np.random.Generator) -> list[_Shift]:
+    """One small as a candidate's error, one beyond the true marking."""
+    near, far = rng.normal(0.0, 0.02, 2)
+    beyond = rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.45)
+    return [_Shift(near, far, rng.normal(0.0, 0.003)), _Shift(beyond + near, beyond + far, rng.normal(0.0, 0.003))]
+
+
+def _moved(candidate: Candidate, view: RoadView, shift: _Shift) -> Candidate:
+    """The candidate moved by `shift`, a leaning one farther, as its strip is wider and its error counts less."""
     v, b, k = candidate.curve.coefficients
+    leaning = float(np.hypot(1.0, b))
+    near, far = leaning * shift.near * view.depth, leaning * shift.far * 0.5 * view.depth
     tilt = (near - far) / (0.5 * view.depth)
-    curve = Curve(candidate.curve.horizon, (v + near - tilt * view.depth, b + tilt, k))
+    bend = shift.bend * view.depth**2
+    curve = Curve(candidate.curve.horizon, (v + near - tilt * view.depth, b + tilt, k + bend))
     rows = visible_rows(curve, view, 0.1)
     top, bottom = rows if rows is not None else (candidate.top, candidate.bottom)
     return Candidate(curve, top, bottom, candidate.strength)

@@ -105,7 +105,7 @@ def _warm(path: Path, provider: Provider) -> OnnxModel:
 
 def _candidates(info: ClassifierInfo, glance: RoadGlance | None) -> CandidateDetector:
     """The detector that asks a classifier about the strips it was trained on."""
-    strip = StripGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width)
+    strip = StripGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width, info.strip.lean)
     return CandidateDetector(info.threshold, glance, cutter=StripCutter(strip))
 
 

@@ -6,6 +6,7 @@ resize by s maps x to s (x + 0.5) - 0.5.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,21 +90,25 @@ class StripGeometry:
     """How a strip along a candidate is cut: `size` x `size` network pixels, wide in proportion to the road's scale.
 
     At a row y the strip reaches `half_width` (y - horizon) to either side of its candidate, a constant width on a flat
-    road, and never less than `min_half_width` pixels of a 640 pixel wide image.
+    road, and never less than `min_half_width` pixels of a 640 pixel wide image. A candidate that leans by `slope`
+    columns a row has a strip wider by hypot(1, lean slope): with a `lean` of 1 strips are equally wide across their
+    candidates, as errors are counted across them; with 0 they are equally wide on the ground.
     """
 
     size: int = 224
-    half_width: float = 0.5
-    min_half_width: float = 5.0
+    half_width: float = 0.33
+    min_half_width: float = 4.0
+    lean: float = 1.0
 
     def rows(self, top: float, bottom: float) -> FloatArray:
         """Image rows of the patch rows, from the top of the patch to its bottom; shape (size,)."""
         return np.linspace(top, bottom, self.size)
 
-    def half_widths(self, rows: FloatArray, view: RoadView) -> FloatArray:
-        """Half the strip's width in pixels at each of `rows`."""
+    def half_widths(self, rows: FloatArray, view: RoadView, slope: float) -> FloatArray:
+        """Half the strip's width in pixels at each of `rows`, for a candidate that leans by `slope`."""
         least = self.min_half_width * view.width / 640.0
-        widths: FloatArray = np.maximum(self.half_width * (rows - view.horizon), least)
+        leaning = math.hypot(1.0, self.lean * slope)
+        widths: FloatArray = leaning * np.maximum(self.half_width * (rows - view.horizon), least)
         return widths
 
     def grid(
@@ -112,7 +117,8 @@ class StripGeometry:
         """Image (columns, rows) that the pixels of a patch are sampled at, each (size, size)."""
         rows = self.rows(top, bottom)
         across = np.linspace(-1.0, 1.0, self.size, dtype=np.float32)
-        half_widths = self.half_widths(rows, view).astype(np.float32)
+        slope = float(curve.slope(0.5 * (top + bottom)))
+        half_widths = self.half_widths(rows, view, slope).astype(np.float32)
         columns = curve.x(rows).astype(np.float32)[:, None] + half_widths[:, None] * across
         return columns, np.broadcast_to(rows.astype(np.float32)[:, None], columns.shape)
 

@@ -20,6 +20,7 @@ class StripInfo(BaseModel):
     size: int = Field(gt=0)
     half_width: float = Field(gt=0.0)
     min_half_width: float = Field(gt=0.0)
+    lean: float = Field(default=0.0, ge=0.0)
 
 
 class CanvasInfo(BaseModel):
