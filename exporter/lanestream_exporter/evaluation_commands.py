@@ -6,12 +6,12 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 from rich.console import Console
 
-from lanestream.engine import SHIPPED_MODEL, load_engine
+from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
 from lanestream.errors import LabelError, ModelError, SourceError, needs_extra
 from lanestream_exporter.datasets.folder import DataFolder
 from lanestream_exporter.datasets.formats import FORMATS
@@ -27,6 +27,10 @@ from lanestream_exporter.evaluation.tables import tables
 if TYPE_CHECKING:
     from lanestream_exporter.datasets.splits import Split
 
+_NONE: Final = Path("none")
+_REGRESSOR: Final = "Regressor that shows classifiers where to look, or `none`.  [default: the shipped one]"
+_NARROWEST: Final = 100  # columns of the tables, also where the terminal has fewer
+
 
 @click.command()
 @click.option(
@@ -37,6 +41,7 @@ if TYPE_CHECKING:
     default=[SHIPPED_MODEL],
     help="ONNX file; give it again for another one.  [default: the shipped classifier]",
 )
+@click.option("--regressor", type=click.Path(path_type=Path), help=_REGRESSOR)
 @click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), help="Folder that report.html is written to.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")
@@ -49,7 +54,13 @@ if TYPE_CHECKING:
     "--format", "form", type=click.Choice(["auto", *FORMATS]), default="auto", help="The form of your labels."
 )
 def evaluate(
-    models: Sequence[Path], split: Split, out: Path | None, json_path: Path | None, data: Path | None, form: str
+    models: Sequence[Path],
+    regressor: Path | None,
+    split: Split,
+    out: Path | None,
+    json_path: Path | None,
+    data: Path | None,
+    form: str,
 ) -> None:
     """Measure model files and two classical peers on labelled frames.
 
@@ -57,9 +68,11 @@ def evaluate(
     describes every figure. Your own frames are measured as single images, all of them.
     """
     material = _material(data, form, split)
-    evaluation = measure(_methods(models), material, lambda stage: click.echo(f"measuring {stage} ...", err=True))
+    evaluation = measure(
+        _methods(models, regressor), material, lambda stage: click.echo(f"measuring {stage} ...", err=True)
+    )
     figures = evaluation.figures()
-    console = Console(soft_wrap=True)
+    console = Console(width=max(_NARROWEST, Console().width))
     for table in tables(figures):
         console.print(table)
     if out is not None:
@@ -100,8 +113,11 @@ def _writing(path: Path) -> Iterator[None]:
         raise SourceError(f"can't write {path}: {(error.strerror or str(error)).lower()}") from None
 
 
-def _methods(models: Sequence[Path]) -> list[Method]:
-    ours = [Model(load_engine(path, "cpu")) for path in models]
+def _methods(models: Sequence[Path], regressor: Path | None) -> list[Method]:
+    if regressor is None and SHIPPED_REGRESSOR.is_file():
+        regressor = SHIPPED_REGRESSOR
+    guide = None if regressor == _NONE else regressor
+    ours = [Model(load_engine(path, "cpu", guide)) for path in models]
     methods: list[Method] = [*ours, Peer(HoughLinesPeer()), Peer(SlidingWindowPeer())]
     names = [method.name for method in methods]
     twice = next((name for name in names if names.count(name) > 1), None)

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from lanestream.detection import Prepared
-from lanestream.detection.candidates import Proposals
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
@@ -240,7 +239,7 @@ def test_candidates_under_both_rules() -> None:
     candidates = tuple(Candidate(curve(-1.1, 640.0 + v), 252.0, 719.0, 1.0) for v in shifts)
     prepared = Prepared(np.zeros((720, 1280, 3), np.uint8), np.zeros((4, 8, 8, 3), np.uint8), view, candidates)
     outputs = np.array([[0.05, 0.95], [0.75, 0.25], [0.05, 0.95], [0.85, 0.15]], np.float32)
-    judged = judge(prepared, outputs, Proposals(candidates[::-1], view, 1.0), labels)
+    judged = judge(prepared, outputs, replace(prepared, candidates=candidates[::-1]), labels)
     figures = candidate_figures([Outcome(labels, (), judged)], 0.5)
     assert figures["far_40"]["confusion"] == {"tp": 1, "fp": 0, "fn": 1, "tn": 1}
     assert (figures["far_40"]["unsure"], figures["far_30"]["unsure"]) == (1, 0)

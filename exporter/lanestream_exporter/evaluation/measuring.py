@@ -74,7 +74,7 @@ class Evaluation:
         return {
             "schema": SCHEMA,
             "material": self.material.name,
-            "methods": {method.name: {"kind": method.kind} for method in self.methods},
+            "methods": {m.name: {"kind": m.kind, "guided_by": m.guided_by} for m in self.methods},
             "images": {method.name: self._of_images(method) for method in self.methods},
             "clips": {method.name: self._of_clips(method) for method in self.methods},
         }

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol
 
-from lanestream.detection.candidates import CandidateSearch
 from lanestream.detection.detector import CandidateDetector
 from lanestream.engine import Engine
 from lanestream.lanes import FrameResult, Image
@@ -36,6 +35,11 @@ class Method(Protocol):
         """The probability from which on a candidate is accepted; None for what has no candidates."""
         ...
 
+    @property
+    def guided_by(self) -> str | None:
+        """The regressor that shows a classifier where to look; None without one."""
+        ...
+
     def look(self, image: Image, frame: LabelledFrame) -> Outcome:
         """A BGR image (H, W, 3) by itself."""
         ...
@@ -53,8 +57,13 @@ class Model:
         self.name = engine.network.name
         self.kind = str(engine.network.metadata["kind"])
         detector = engine.detector
-        self.threshold = detector.threshold if isinstance(detector, CandidateDetector) else None
-        self._search = _longer(detector.search) if isinstance(detector, CandidateDetector) else None
+        self._wide: CandidateDetector | None = None
+        self.threshold: float | None = None
+        self.guided_by: str | None = None
+        if isinstance(detector, CandidateDetector):
+            self._wide = replace(detector, search=replace(detector.search, limit=MOST_CANDIDATES))
+            self.threshold = detector.threshold
+            self.guided_by = None if detector.glance is None else detector.glance.network.name
 
     def look(self, image: Image, frame: LabelledFrame) -> Outcome:
         """A single image: the first frame of a new session."""
@@ -62,9 +71,9 @@ class Model:
         prepared = session.prepare(image)
         outputs = self._engine.network.run(prepared.inputs)
         found = _found(session.conclude(prepared, outputs, 0.0))
-        if self._search is None:
+        if self._wide is None:
             return Outcome(frame, found)
-        return Outcome(frame, found, judge(prepared, outputs, self._search.propose(image), frame))
+        return Outcome(frame, found, judge(prepared, outputs, self._wide.prepare(image), frame))
 
     def follow(self) -> Follower:
         """A session with its tracker."""
@@ -90,6 +99,7 @@ class Peer:
 
     kind = "peer"
     threshold = None
+    guided_by = None
 
     def __init__(self, finder: FinderOfBoundaries) -> None:
         self._finder = finder
@@ -102,10 +112,6 @@ class Peer:
     def follow(self) -> Follower:
         """The same, frame by frame."""
         return lambda image, _: self._finder.find(image)
-
-
-def _longer(search: CandidateSearch) -> CandidateSearch:
-    return replace(search, limit=MOST_CANDIDATES)
 
 
 def _found(result: FrameResult) -> tuple[Found, ...]:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import Prepared
-from lanestream.detection.candidates import Proposals
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import Found, ego_sides
 from lanestream_exporter.patches import TruthRule, distance_along
@@ -44,15 +43,13 @@ class Outcome:
     candidates: JudgedCandidates | None = None
 
 
-def judge(
-    prepared: Prepared, outputs: NDArray[np.float32], proposals: Proposals, frame: LabelledFrame
-) -> JudgedCandidates:
-    """The candidates that the classifier saw against the labels, and up to 32 of those that could be proposed."""
+def judge(prepared: Prepared, outputs: NDArray[np.float32], wide: Prepared, frame: LabelledFrame) -> JudgedCandidates:
+    """The candidates that the classifier saw against the labels, and those up to 32 that `wide` has instead."""
     verdicts = {name: rule.judge(prepared.candidates, frame, prepared.view) for name, rule in RULES.items()}
     ego, near = ego_sides(frame), RULES["far_40"]
     proposed = []
     for lane in frame.lanes:
-        measured = [distance_along(c, lane, proposals.view) for c in proposals.candidates[:MOST_CANDIDATES]]
+        measured = [distance_along(c, lane, wide.view) for c in wide.candidates[:MOST_CANDIDATES]]
         true = [d * 1280.0 / frame.width <= near.near and overlap >= near.overlap for d, overlap in measured]
         place = true.index(True) if any(true) else None
         proposed.append(Proposed(any(lane is mine for mine in ego), place))
