@@ -3,52 +3,126 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, get_args
 
 import click
+from rich.console import Console
+from rich.table import Table
 
+from lanestream.errors import ExportError
+from lanestream.geometry import StripGeometry
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.export import ExportReport, ExportSettings, export_classifier
-from lanestream_exporter.patchstore import PatchStore, read_stores
-from lanestream_exporter.rendering import real_store
-from lanestream_exporter.training.checkpoints import read_checkpoint
-from lanestream_exporter.training.patchfiles import patches_of_run
+from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
+from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
+from lanestream_exporter.exporting.frames import FrameSource
+from lanestream_exporter.exporting.normalisation import NORMALISATIONS
+from lanestream_exporter.exporting.proof import Measured
+from lanestream_exporter.exporting.subject import Precision
 
-_DATA = click.option(
-    "--data",
-    type=click.Path(path_type=Path),
-    help="Folder of real frames [default: the patches of the run, else $LANESTREAM_DATA].",
-)
+_STRIP = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
+
+
+def _classes(_context: click.Context, _option: click.Parameter, value: str | None) -> tuple[str, ...] | None:
+    return None if value is None else tuple(name.strip() for name in value.split(","))
+
+
+def _strip(_context: click.Context, _option: click.Parameter, value: str | None) -> StripGeometry | None:
+    """The strip geometry in `size=224,half_width=0.5,min_half_width=5`; what isn't named has its usual value."""
+    if value is None:
+        return None
+    given: dict[str, Any] = {}
+    for part in filter(None, value.split(",")):
+        key, _, number = (word.strip() for word in part.partition("="))
+        if key not in _STRIP:
+            raise click.BadParameter(f"there is no {key!r}; accepted: {', '.join(_STRIP)}")
+        try:
+            given[key] = _STRIP[key](number)
+        except ValueError:
+            raise click.BadParameter(f"{key} must be a number, not {number!r}") from None
+        if not 0 < given[key] < float("inf"):
+            raise click.BadParameter(f"{key} must be above 0")
+    return StripGeometry(**given)
 
 
 @click.command()
 @click.argument("checkpoint", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--precision", type=click.Choice(["fp32", "int8"]), default=ExportSettings.precision, show_default=True)
+@click.option(
+    "--precision", type=click.Choice(get_args(Precision)), default=ExportSettings.precision, show_default=True
+)
 @click.option(
     "--rank-energy", type=click.FloatRange(0.5, 1.0), default=ExportSettings.rank_energy, show_default=True,
     help="Share of the hidden layers' variance to keep; 1 keeps the layers as they are.",
 )  # fmt: skip
-@_DATA
-def export(checkpoint: Path, out: Path, precision: str, rank_energy: float, data: Path | None) -> None:
-    """Write CHECKPOINT as the ONNX file OUT that serves, after proving that it does the same.
+@click.option(
+    "--tolerance", type=click.FloatRange(0.0, 100.0), default=ExportSettings.tolerance, show_default=True,
+    help="Points of accuracy that the file may lose.",
+)  # fmt: skip
+@click.option(
+    "--data", type=click.Path(path_type=Path), envvar="LANESTREAM_DATA", show_envvar=True,
+    help="Folder of real frames; without it rendered scenes alone are used.",
+)  # fmt: skip
+@click.option(
+    "--scenes", type=click.IntRange(4), default=FrameSource.rendered, show_default=True,
+    help="Rendered scenes to calibrate with, and as many to prove the file with.",
+)  # fmt: skip
+@click.option("--name", help="What the model is called  [default: by its kind]")
+@click.option("--classes", callback=_classes, help="Of a torchvision AlexNet: its classes in order, say false,lane.")
+@click.option(
+    "--strip", callback=_strip, help="Of a torchvision AlexNet: its strips, size=224,half_width=0.5,min_half_width=5."
+)
+@click.option(
+    "--normalisation", type=click.Choice(list(NORMALISATIONS)), default=Foreign.normalisation, show_default=True,
+    help="Of a torchvision AlexNet: how its training normalised pixels.",
+)  # fmt: skip
+def export(checkpoint: Path, out: Path, **given: Any) -> None:
+    """Write CHECKPOINT as the ONNX file OUT that serves, after proving that it does the same."""
+    if out.is_dir():
+        raise ExportError(f"{out} is a folder", "give the path of the file to write")
+    foreign = _foreign(given["classes"], given["strip"], given["normalisation"])
+    # What is no checkpoint is told now, not after the frames have been made.
+    subject, training = read_subject(checkpoint, foreign)
+    source = FrameSource(data_root(given["data"]) if given["data"] else None, rendered=given["scenes"])
+    settings = ExportSettings(
+        given["name"] or subject.name, given["precision"], given["rank_energy"], given["tolerance"]
+    )
+    _tell(out, export_network(subject, out, settings, Provenance(training, source), click.echo), source)
 
-    It is calibrated and proved on the patches of its run, or on those of the real frames in --data.
-    """
-    read_checkpoint(checkpoint)  # what is no checkpoint is told now, not after the patches have been made
-    patches = None if data is not None else patches_of_run(checkpoint.parent)
-    train_patches, check = patches or _real_patches(checkpoint.parent / "patches", data_root(data))
-    settings = ExportSettings(precision="fp32" if precision == "fp32" else "int8", rank_energy=rank_energy)
-    _tell(export_classifier(checkpoint, out, settings, train_patches, check))
+
+def _foreign(classes: tuple[str, ...] | None, strip: StripGeometry | None, normalisation: str) -> Foreign | None:
+    if classes is None and strip is None:
+        return None
+    if classes is None or strip is None:
+        raise click.UsageError("a torchvision AlexNet needs both --classes and --strip")
+    return Foreign(classes, strip, normalisation)
 
 
-def _real_patches(folder: Path, root: Path) -> tuple[PatchStore, PatchStore]:
-    train, check = (read_stores([real_store(folder, root, split)]) for split in ("train", "val"))
-    return train, check
+def _tell(out: Path, report: ExportReport, source: FrameSource) -> None:
+    rows = [report.checkpoint, report.fp32, *([] if report.written is report.fp32 else [report.written])]
+    title = f"{report.inputs} inputs of {report.frames} validation frames: {source.origin}"
+    table = Table("", title=title, title_justify="left")
+    names = [name.replace("_", " ") for name in report.written.figures]
+    for heading in ("size", *names, "difference", "largest", "CPU"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(*_cells(row))
+    Console(width=140, highlight=False).print(table)
+    calibration, found = report.subject.calibration, report.boundaries
+    click.echo(f"temperature {calibration.temperature:.3f}, threshold {calibration.threshold:.2f}")
+    click.echo(
+        f"boundaries: {found.both} by PyTorch and by the file, {found.alone} by one alone; "
+        f"{found.mean:.3f} px apart on average, {found.largest:.2f} at most (of 640 wide)"
+    )
+    for other, lost in report.lost.items():
+        click.echo(f"{report.written.name} against {other}: {lost:.2f} points of accuracy lost")
+    if report.time_ratio is not None:
+        click.echo(f"{report.written.name} against fp32, the same network: {report.time_ratio:.2f} of the time")
+    click.echo(f"{out}: {report.written.size or 0:,} bytes")
 
 
-def _tell(report: ExportReport) -> None:
-    click.echo(f"{report.path}: {report.size / 1e6:.1f} MB")
-    click.echo(f"temperature {report.calibration.temperature:.3f}, threshold {report.calibration.threshold:.2f}")
-    for name, accuracy in report.accuracy.items():
-        click.echo(f"accuracy {name}: {accuracy:.4f} of {report.patches} validation patches")
-    click.echo(f"difference: {report.mean_difference:.5f} on average, {report.largest_difference:.5f} at most")
+def _cells(row: Measured) -> list[str]:
+    figures = [f"{value:.2f} px" if name.endswith("_px") else f"{value:.4f}" for name, value in row.figures.items()]
+    if row.size is None or row.milliseconds is None:
+        return [f"{row.name}, PyTorch", "", *figures, "", "", ""]
+    size, time = f"{row.size / 1e6:.1f} MB", f"{row.milliseconds:.2f} ms"
+    return [f"{row.name} file", size, *figures, f"{row.mean_difference:.1e}", f"{row.largest_difference:.1e}", time]

@@ -1,170 +1,226 @@
-"""From AlexNet in PyTorch to the file that serves: folding, truncation, calibration, the file itself, refusals."""
+"""From a network in PyTorch to the file that serves: its answers, what it says of itself, refusals."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 import torch
-from numpy.typing import NDArray
 
-from lanestream.errors import CheckpointError, ExportError, ModelError, ProviderError
-from lanestream.inference import OnnxModel
+from lanestream.engine import load_engine
+from lanestream.errors import ExportError, ModelError, ProviderError
+from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
 from lanestream.inference.model_info import METADATA_KEY
-from lanestream_exporter import export
-from lanestream_exporter.alexnet import AlexNet, initialise, normalise
-from lanestream_exporter.calibration import calibrated
-from lanestream_exporter.compression import truncated
-from lanestream_exporter.export import ExportSettings, export_classifier
-from lanestream_exporter.patchstore import PatchStore, read_stores, write_store
-from lanestream_exporter.training.checkpoints import read_checkpoint
+from lanestream_exporter.alexnet import AlexNet, normalise
+from lanestream_exporter.exporting import export
+from lanestream_exporter.exporting.calibration import Calibration
+from lanestream_exporter.exporting.classifier import ClassifierSubject
+from lanestream_exporter.exporting.compression import in_batches
+from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
+from lanestream_exporter.exporting.frames import FrameSource
+from lanestream_exporter.exporting.graph import describe, write_graph
+from lanestream_exporter.exporting.regressor import RegressorSubject
+from lanestream_exporter.exporting.subject import Check, Description, Precision, Subject
+from lanestream_exporter.regressor import Answer, LaneRegressor
+
+SOURCE = FrameSource(None, rendered=4)
+PROVENANCE = Provenance({"data": "none", "step": 7}, SOURCE)
+
+
+def settings(precision: Precision) -> ExportSettings:
+    """An untrained network's accuracy is luck: no tolerance for it."""
+    return ExportSettings("tiny", precision, rank_energy=0.9, tolerance=100.0)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A written file, what it measured, and the frames that it was proved on."""
+
+    path: Path
+    report: ExportReport
+    check: Check
+
+
+def exported(subject: Subject, precision: Precision, folder: Path) -> Exported:
+    path = folder / f"{precision}.onnx"
+    steps: list[str] = []
+    report = export_network(subject, path, settings(precision), PROVENANCE, steps.append)
+    assert "rendered" in steps[0]
+    return Exported(path, report, report.subject.check(SOURCE))
 
 
 @pytest.fixture(scope="module")
-def patches() -> NDArray[np.uint8]:
-    rng = np.random.default_rng(0)
-    smooth = rng.integers(0, 256, (32, 14, 14, 3), dtype=np.uint8)
-    return np.repeat(np.repeat(smooth, 16, axis=1), 16, axis=2)
-
-
-@pytest.fixture(scope="module")
-def network() -> AlexNet:
-    """A network whose normalisation layers have something to fold."""
+def classifier(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     torch.manual_seed(0)
-    made = AlexNet()
-    for norm in made.norms.values():
-        assert isinstance(norm, torch.nn.BatchNorm2d)
-        assert norm.running_mean is not None
-        assert norm.running_var is not None
-        torch.nn.init.uniform_(norm.weight, 0.5, 1.5)
-        torch.nn.init.uniform_(norm.bias, -0.2, 0.2)
-        torch.nn.init.uniform_(norm.running_mean, -0.2, 0.2)
-        torch.nn.init.uniform_(norm.running_var, 0.5, 2.0)
-    return made.eval()
+    network = AlexNet(normalised=False).eval()
+    with torch.no_grad():  # a fresh AlexNet answers every patch alike
+        network.classifier[6].weight.mul_(4000.0)  # type: ignore[operator, union-attr]
+    return exported(ClassifierSubject(network), "int8", tmp_path_factory.mktemp("classifier"))
 
 
 @pytest.fixture(scope="module")
-def store(patches: NDArray[np.uint8], tmp_path_factory: pytest.TempPathFactory) -> PatchStore:
-    path = tmp_path_factory.mktemp("patches") / "all.npz"
-    write_store(path, [(patch, i % 2) for i, patch in enumerate(patches)])
-    return read_stores([path])
+def regressor(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    torch.manual_seed(0)
+    network = LaneRegressor().eval().folded()
+    return exported(RegressorSubject(network), "fp32", tmp_path_factory.mktemp("regressor"))
 
 
-@pytest.fixture(scope="module")
-def checkpoint(network: AlexNet, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("run") / "best.pt"
-    torch.save({"network": network.state_dict(), "step": 7}, path)
-    return path
-
-
-@torch.inference_mode()
-def test_folding_keeps_the_function_and_leaves_the_plain_topology(network: AlexNet, patches: NDArray[np.uint8]) -> None:
-    plain = network.folded()
-    x = normalise(torch.from_numpy(patches[:4]))
-    torch.testing.assert_close(plain(x), network(x), rtol=1e-3, atol=1e-4)
-    assert not [key for key in plain.state_dict() if key.startswith("norms.")]
-
-
-def test_the_plain_network_has_torchvisions_keys_and_shapes() -> None:
-    shapes = {key: tuple(value.shape) for key, value in AlexNet(1000, normalised=False).state_dict().items()}
-    assert shapes["features.0.weight"] == (64, 3, 11, 11)
-    assert shapes["features.10.weight"] == (256, 256, 3, 3)
-    assert shapes["classifier.1.weight"] == (4096, 9216)
-    assert shapes["classifier.6.bias"] == (1000,)
-    assert sum(int(np.prod(shape)) for shape in shapes.values()) == 61_100_840
-
-
-@torch.inference_mode()
-def test_truncation_is_small_and_nearly_exact_on_what_it_saw(network: AlexNet, patches: NDArray[np.uint8]) -> None:
-    plain = network.folded()
-    small = truncated(plain, 0.999, patches)
-    weights = [sum(p.numel() for p in net.classifier.parameters()) for net in (plain, small)]
-    assert weights[1] < 0.05 * weights[0]
-    x = normalise(torch.from_numpy(patches))
-    spread = plain(x).std().item()
-    assert (small(x) - plain(x)).abs().max().item() < 0.3 * spread
-
-
-@torch.inference_mode()
-def test_brightness_and_contrast_of_a_patch_do_not_matter(patches: NDArray[np.uint8]) -> None:
-    dim = (patches[:2].astype(np.float32) * 0.5 + 20.0).astype(np.uint8)
-    difference = normalise(torch.from_numpy(dim)) - normalise(torch.from_numpy(patches[:2]))
-    assert difference.abs().mean().item() < 0.1
-
-
-def test_calibration_finds_the_temperature_that_made_the_labels() -> None:
-    rng = np.random.default_rng(1)
-    margin = rng.normal(0.0, 3.0, 20_000)
-    labels = (rng.random(20_000) < 1.0 / (1.0 + np.exp(-margin))).astype(np.int64)
-    logits = np.stack([np.zeros(20_000), 2.5 * margin], axis=1).astype(np.float32)
-    found = calibrated(logits, labels)
-    assert found.temperature == pytest.approx(2.5, rel=0.1)
-    assert 0.3 < found.threshold < 0.6
-
-
-@pytest.fixture(scope="module")
-def exported(checkpoint: Path, store: PatchStore, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("models") / "small.onnx"
-    report = export_classifier(checkpoint, path, ExportSettings(precision="fp32", rank_energy=0.999), store, store)
-    assert report.path == path
-    assert report.largest_difference < 1e-3
-    return path
-
-
-def test_the_file_serves_any_batch_alike(exported: Path, patches: NDArray[np.uint8]) -> None:
-    model = OnnxModel.load(exported, "cpu")
-    whole = model.run(patches)
-    assert whole.shape == (32, 2)
+def test_the_classifiers_file_answers_as_pytorch_does_at_any_batch_size(classifier: Exported) -> None:
+    model = OnnxModel.load(classifier.path, "cpu")
+    inputs = classifier.check.inputs[:20]
+    expected = in_batches(classifier.report.subject.served(), inputs).numpy()
+    assert expected[:, 1].std() > 0.02
+    whole = model.run(inputs)
     np.testing.assert_allclose(whole.sum(axis=1), 1.0, atol=1e-5)
-    np.testing.assert_allclose(np.concatenate([model.run(p[None]) for p in patches[:5]]), whole[:5], atol=1e-4)
-    assert model.run(patches[:0]).shape == (0, 2)
-    assert model.provider == "cpu"
+    assert np.abs(whole - expected).mean() < 0.2 * expected[:, 1].std()
+    np.testing.assert_allclose(np.concatenate([model.run(p[None]) for p in inputs[:5]]), whole[:5], atol=1e-4)
+    assert model.run(inputs[:0]).shape == (0, 2)
 
 
-def test_the_file_describes_itself_and_is_small(exported: Path) -> None:
-    info = OnnxModel.load(exported, "cpu").info
-    assert (info.kind, info.precision, info.strip.size) == ("classifier", "fp32", 224)
-    assert info.training["step"] == 7
-    assert info.metrics["validation_patches"] == 32
-    assert exported.stat().st_size < 25e6
+def test_int8_is_measured_against_fp32_and_much_smaller(classifier: Exported) -> None:
+    report = classifier.report
+    assert (report.fp32.name, report.written.name) == ("fp32", "int8")
+    assert report.fp32.largest_difference < 1e-3 < report.written.largest_difference
+    assert report.written.size == pytest.approx(0.25 * (report.fp32.size or 0), rel=0.2)
+    assert set(report.lost) == {"checkpoint", "fp32"}
+    assert report.time_ratio is not None
+    assert report.inputs == len(classifier.check.inputs)
+
+
+def test_the_regressors_file_says_what_its_answer_is(regressor: Exported) -> None:
+    subject = regressor.report.subject
+    assert isinstance(subject, RegressorSubject)
+    inputs = regressor.check.inputs
+    with torch.inference_mode():
+        answer = Answer.of(subject.network(normalise(torch.from_numpy(inputs))))
+    told = replace(answer, presence=answer.presence / subject.calibration.temperature).told().numpy()
+    np.testing.assert_allclose(OnnxModel.load(regressor.path, "cpu").run(inputs), told, atol=1e-4)
+    assert regressor.report.written is regressor.report.fp32
+    assert regressor.report.time_ratio is None
+
+
+def test_the_regressors_small_layers_stay_exact_in_int8(regressor: Exported, tmp_path: Path) -> None:
+    subject = regressor.report.subject
+    small = tmp_path / "int8.onnx"
+    export.quantized(regressor.path, small, regressor.check.inputs, subject.exact)
+    weights = {tensor.name: tensor.data_type for tensor in onnx.load(str(small)).graph.initializer}
+    floats = [name for name, kind in weights.items() if kind == onnx.TensorProto.FLOAT and name.endswith("weight")]
+    assert {name.split(".")[1] for name in floats} == {"shape", "doubts"}
+    info = OnnxModel.load(regressor.path, "cpu").info
+    describe(small, info)
+    expected = in_batches(subject.served(), regressor.check.inputs).numpy()
+    assert np.abs(OnnxModel.load(small, "cpu").run(regressor.check.inputs) - expected).mean() < 0.01
+
+
+def test_both_files_are_served_by_their_detectors(classifier: Exported, regressor: Exported) -> None:
+    for made in (classifier, regressor):
+        engine = load_engine(made.path, "cpu")
+        prepared = made.check.prepared[0]
+        findings = engine.detector.finish(prepared, engine.network.run(prepared.inputs))
+        assert findings.view.width == prepared.view.width
+        assert type(engine.detector) is type(made.report.subject.detector)
+
+
+def test_the_files_describe_themselves(classifier: Exported, regressor: Exported) -> None:
+    info = OnnxModel.load(classifier.path, "cpu").info
+    assert isinstance(info, ClassifierInfo)
+    assert (info.precision, info.classes, info.strip.size) == ("int8", ("false", "lane"), 224)
+    assert info.training == {
+        "data": "none", "step": 7, "rank_energy": 0.9, "export_frames": "rendered scenes", "normalisation": "contrast",
+    }  # fmt: skip
+    assert info.metrics["frame_count"] == 4
+    assert info.metrics["accuracy"] == pytest.approx(classifier.report.written.figures["accuracy"], abs=1e-4)
+    assert info.threshold == classifier.report.subject.calibration.threshold
+    other = OnnxModel.load(regressor.path, "cpu").info
+    assert isinstance(other, RegressorInfo)
+    assert (other.canvas.size, other.canvas.detail_width, other.precision) == (224, 448, "fp32")
+    assert "onnxruntime" in other.exporter
+
+
+def test_half_precision_loads_on_the_cpu_and_agrees(classifier: Exported, tmp_path: Path) -> None:
+    subject = classifier.report.subject
+    path = tmp_path / "fp16.onnx"
+    write_graph(subject.served(half=True), path, subject.input_name, subject.output_name)
+    describe(path, subject.info(Description("half", "fp16", {}, {})))
+    graph = onnx.load(str(path)).graph
+    weights = [tensor for tensor in graph.initializer if tensor.name.endswith("weight")]
+    assert {tensor.data_type for tensor in weights} == {onnx.TensorProto.FLOAT16}
+    assert graph.input[0].type.tensor_type.elem_type == onnx.TensorProto.UINT8
+    assert graph.output[0].type.tensor_type.elem_type == onnx.TensorProto.FLOAT
+    inputs = classifier.check.inputs[:8]
+    expected = in_batches(subject.served(), inputs).numpy()
+    np.testing.assert_allclose(OnnxModel.load(path, "cpu").run(inputs), expected, atol=0.02)
 
 
 def test_a_file_that_differs_is_not_written(
-    checkpoint: Path, store: PatchStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    classifier: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(export, "_TOLERANCE", 0.0)
-    monkeypatch.setattr(export, "_to_onnx", _other_network)
+    monkeypatch.setattr(export, "write_graph", _other_network)
     out = tmp_path / "refused.onnx"
-    with pytest.raises(ExportError, match="differs from PyTorch"):
-        export_classifier(checkpoint, out, ExportSettings(precision="fp32", rank_energy=0.9), store, store)
-    assert not out.exists()
+    with pytest.raises(ExportError, match=r"differs from PyTorch by 0\.\d+ on average"):
+        export_network(classifier.report.subject, out, settings("fp32"), PROVENANCE, lambda _: None)
+    assert not list(tmp_path.iterdir())
 
 
-def _other_network(_: export.ServedNetwork, path: Path) -> None:
+def _other_network(_: Any, path: Path, input_name: str, output_name: str) -> None:
     """Writes a file that answers every patch with certainty."""
     helper = onnx.helper
-    shape = helper.make_node("Shape", ["patches"], ["shape"], start=0, end=1)
+    shape = helper.make_node("Shape", [input_name], ["shape"], start=0, end=1)
     two = helper.make_node("Constant", [], ["two"], value_ints=[2])
     both = helper.make_node("Concat", ["shape", "two"], ["size"], axis=0)
-    ones = helper.make_node(
-        "ConstantOfShape", ["size"], ["probabilities"], value=helper.make_tensor("v", 1, [1], [1.0])
-    )
+    ones = helper.make_node("ConstantOfShape", ["size"], [output_name], value=helper.make_tensor("v", 1, [1], [1.0]))
     graph = helper.make_graph(
         [shape, two, both, ones],
         "certain",
-        [helper.make_tensor_value_info("patches", onnx.TensorProto.UINT8, ["N", 224, 224, 3])],
-        [helper.make_tensor_value_info("probabilities", onnx.TensorProto.FLOAT, ["N", 2])],
+        [helper.make_tensor_value_info(input_name, onnx.TensorProto.UINT8, ["N", 224, 224, 3])],
+        [helper.make_tensor_value_info(output_name, onnx.TensorProto.FLOAT, ["N", 2])],
     )
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), str(path))
 
 
-def test_wrong_model_files_are_refused_in_one_line(exported: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("lost", "words"),
+    [
+        ({"accuracy": 0.906}, "loses 0.60 points of accuracy against fp32, 0.5 are allowed"),
+        ({"accuracy": float("nan")}, "loses nan points"),
+    ],
+)
+def test_accuracy_beyond_the_tolerance_is_refused(classifier: Exported, lost: dict[str, float], words: str) -> None:
+    report = classifier.report
+    good = {"accuracy": 0.912, "average_precision": 0.9}
+    fp32, checkpoint = replace(report.fp32, figures=good), replace(report.checkpoint, figures={"accuracy": 0.911})
+    passing = replace(report, checkpoint=checkpoint, fp32=fp32, written=replace(report.written, figures=good))
+    told = ExportSettings("x", "int8")
+    export._refuse(passing, told)
+    with pytest.raises(ExportError) as caught:
+        export._refuse(replace(passing, written=replace(report.written, figures=lost)), told)
+    assert words in str(caught.value) or "checkpoint" in str(caught.value)
+    assert "--rank-energy nearer to 1 or --precision fp16 or fp32" in caught.value.hint
+
+
+def test_a_network_from_elsewhere_is_normalised_in_its_own_way(classifier: Exported) -> None:
+    subject = classifier.report.subject
+    assert isinstance(subject, ClassifierSubject)
+    inputs = classifier.check.inputs[:4]
+    theirs = replace(subject, normalisation="imagenet").under(Calibration())
+    means, deviations = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+    pixels = (inputs / 255.0 - np.array(means)) / np.array(deviations)
+    with torch.inference_mode():
+        x = torch.from_numpy(pixels.astype(np.float32)).permute(0, 3, 1, 2)
+        expected = torch.softmax(theirs.network(x), dim=1).numpy()
+    np.testing.assert_allclose(in_batches(theirs.served(), inputs).numpy(), expected, atol=1e-4)
+    assert theirs.info(Description("theirs", "fp32", {}, {})).training == {"normalisation": "imagenet"}
+
+
+def test_wrong_model_files_are_refused_in_one_line(classifier: Exported, tmp_path: Path) -> None:
     text = tmp_path / "text.onnx"
     text.write_text("no model")
     bare = tmp_path / "bare.onnx"
-    model = onnx.load(str(exported))
+    model = onnx.load(str(classifier.path))
     del model.metadata_props[:]
     onnx.save(model, str(bare))
     strange = tmp_path / "strange.onnx"
@@ -182,30 +238,8 @@ def test_wrong_model_files_are_refused_in_one_line(exported: Path, tmp_path: Pat
         assert caught.value.hint
 
 
-def test_cuda_is_not_replaced_in_silence(exported: Path) -> None:
+def test_cuda_is_not_replaced_in_silence(classifier: Exported) -> None:
     with pytest.raises(ProviderError, match="CUDA"):
-        OnnxModel.load(exported, "cuda")
-    auto = OnnxModel.load(exported, "auto")
+        OnnxModel.load(classifier.path, "cuda")
+    auto = OnnxModel.load(classifier.path, "auto")
     assert (auto.provider, auto.reason) == ("cpu", "the installed onnxruntime has no CUDA")
-
-
-def test_wrong_checkpoints_are_refused(tmp_path: Path) -> None:
-    text = tmp_path / "text.pt"
-    text.write_text("no checkpoint")
-    other = tmp_path / "other.pt"
-    torch.save({"weights": torch.zeros(3)}, other)
-    for path in (text, other, tmp_path / "missing.pt"):
-        with pytest.raises(CheckpointError):
-            read_checkpoint(path)
-        with pytest.raises(CheckpointError):
-            initialise(AlexNet(), path)
-
-
-def test_torchvision_weights_are_taken_over(tmp_path: Path) -> None:
-    path = tmp_path / "alexnet.pt"
-    theirs = AlexNet(1000, normalised=False)
-    torch.save(theirs.state_dict(), path)
-    mine = AlexNet()
-    initialise(mine, path)
-    assert torch.equal(mine.features[3].weight, theirs.features[3].weight)  # type: ignore[arg-type, union-attr]
-    assert mine.classes == 2

@@ -1,4 +1,4 @@
-"""Probabilities that mean what they say: a temperature and a threshold, from validation patches alone."""
+"""Probabilities that mean what they say: a temperature and a threshold, from validation frames alone."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from scipy.special import log_softmax, softmax
 
 @dataclass(frozen=True)
 class Calibration:
-    """Logits are divided by `temperature`; from the probability `threshold` on a candidate counts as true."""
+    """Logits are divided by `temperature`; from the probability `threshold` on a boundary counts as there."""
 
-    temperature: float
-    threshold: float
+    temperature: float = 1.0
+    threshold: float = 0.5
 
 
 def calibrated(logits: NDArray[np.float32], labels: NDArray[np.int64]) -> Calibration:
     """The temperature of least log loss and the threshold of best F1, for logits (N, 2) and labels (N,).
 
-    Source of temperature scaling: C. Guo et al., "On calibration of modern neural networks", 2017.
+    Labels that are all alike can't tell either: then nothing is changed. Source of temperature scaling: C. Guo et al.,
+    "On calibration of modern neural networks", 2017.
     """
+    if len(np.unique(labels)) < 2:
+        return Calibration()
     rows = np.arange(len(labels))
 
     def log_loss(log_temperature: float) -> float:

@@ -1,0 +1,58 @@
+"""From PyTorch to ONNX files."""
+
+from __future__ import annotations
+
+import logging
+import os
+import warnings
+from pathlib import Path
+
+import onnx
+import torch
+from torch import nn
+
+from lanestream.errors import ExportError
+from lanestream.inference import ModelInfo
+from lanestream.inference.model_info import METADATA_KEY
+from lanestream_exporter.alexnet import INPUT_SIZE
+
+
+def write_graph(served: nn.Module, path: Path, input_name: str, output_name: str) -> None:
+    """Writes `served`, uint8 (N, 224, 224, 3) in, for any N, to `path`."""
+    example = torch.zeros(2, INPUT_SIZE, INPUT_SIZE, 3, dtype=torch.uint8)
+    # The exporter warns of its own innards and of torchvision's absence: nothing that a user could mend.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            served,
+            (example,),
+            input_names=[input_name],
+            output_names=[output_name],
+            dynamic_shapes=({0: torch.export.Dim("batch", min=1, max=1024)},),
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None  # noqa: S101 - dynamo=True always returns a program
+    program.save(str(path), external_data=False)
+
+
+def describe(path: Path, info: ModelInfo) -> None:
+    """Makes the file at `path` say of itself what `info` says."""
+    model = onnx.load(str(path))
+    onnx.helper.set_model_props(model, {METADATA_KEY: info.model_dump_json()})
+    onnx.save(model, str(path))
+
+
+def publish(unfinished: Path, out: Path) -> None:
+    """Puts a finished file to `out`, whole or not at all. Raises ExportError where nothing can be written there."""
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(unfinished.read_bytes())
+            part.replace(out)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise ExportError(f"can't write {out}: {error.strerror}", "give a path that can be written") from error
