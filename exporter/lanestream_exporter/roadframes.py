@@ -31,7 +31,7 @@ class RoadFrame:
     """A frame as the regressor learns from it: its picture as JPEG bytes, and in pixels of that picture its boundaries.
 
     `lanes` are polylines (N, 2) from the lowest row upwards; `horizon` is the row at which they meet. `exhaustive` says
-    that what is not labelled is not there.
+    that what is not labelled is not there. `group` names the drive or clip.
     """
 
     jpeg: bytes
@@ -40,6 +40,7 @@ class RoadFrame:
     lanes: tuple[FloatArray, ...]
     horizon: float
     exhaustive: bool
+    group: str
 
     def image(self) -> Image:
         """The picture, BGR (H, W, 3)."""
@@ -61,7 +62,7 @@ class RoadFrame:
         if horizon is None:
             return None
         jpeg = cv2.imencode(".jpg", small, _JPEG)[1].tobytes()
-        return cls(jpeg, width, height, lanes, horizon, frame.exhaustive)
+        return cls(jpeg, width, height, lanes, horizon, frame.exhaustive, frame.group)
 
 
 def shared_horizon(lanes: Sequence[FloatArray], height: int, expected: float | None) -> float | None:
@@ -152,11 +153,11 @@ def read_frames(path: Path) -> list[RoadFrame]:
     ends = np.cumsum(sizes)
     return [
         RoadFrame(
-            data[end - size : end].tobytes(), note["width"], note["height"],
-            tuple(np.asarray(lane, dtype=float) for lane in note["lanes"]), note["horizon"], note["exhaustive"],
+            data[end - size : end].tobytes(),
+            **{**note, "lanes": tuple(np.asarray(lane, dtype=float) for lane in note["lanes"])},
         )
         for end, size, note in zip(ends, sizes, notes, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _note(frame: RoadFrame) -> dict[str, object]:
@@ -166,6 +167,7 @@ def _note(frame: RoadFrame) -> dict[str, object]:
         "lanes": [np.round(lane, 3).tolist() for lane in frame.lanes],
         "horizon": frame.horizon,
         "exhaustive": frame.exhaustive,
+        "group": frame.group,
     }
 
 

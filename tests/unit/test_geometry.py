@@ -61,8 +61,16 @@ def test_visible_rows_stop_where_the_curve_leaves_the_image() -> None:
 
 def test_strip_follows_its_curve_and_widens_with_the_road() -> None:
     curve = Curve(160.0, (320.0, 0.5, 400.0))
-    columns, rows = StripGeometry(size=33).grid(curve, 200.0, 350.0, VIEW)
+    columns, rows = StripGeometry(size=33, half_width=0.5, lean=0.0).grid(curve, 200.0, 350.0, VIEW)
     assert columns.shape == rows.shape == (33, 33)
     np.testing.assert_allclose(columns[:, 16], curve.x(rows[:, 16]), atol=1e-3)
     widths = columns[:, -1] - columns[:, 0]
     np.testing.assert_allclose(widths, rows[:, 0] - 160.0, rtol=1e-4)
+
+
+def test_a_leaning_strip_is_as_wide_across_its_candidate_as_an_upright_one() -> None:
+    leaning, upright = (
+        StripGeometry(size=33).grid(Curve(160.0, (320.0, slope, 0.0)), 200.0, 350.0, VIEW)[0] for slope in (3.0, 0.0)
+    )
+    across = (leaning[:, -1] - leaning[:, 0]) / np.hypot(1.0, 3.0)
+    np.testing.assert_allclose(across, upright[:, -1] - upright[:, 0], rtol=1e-4)

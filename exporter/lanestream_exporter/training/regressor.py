@@ -79,9 +79,8 @@ class RegressorTask:
         real = round(config.batch * share)
         drawn: list[tuple[np.ndarray[Any, np.dtype[np.uint8]], Target]] = []
         for name, count in (("real", real), ("rendered", config.batch - real)):
-            frames = self._sources[name].train if count else ()
-            chosen = rng.integers(len(frames), size=count) if count else ()
-            drawn += [sample(frames[int(i)], self._geometry, Warp.drawn(rng)) for i in chosen]
+            frames = drawn_frames(self._sources[name].train, count, rng) if count else []
+            drawn += [sample(frame, self._geometry, Warp.drawn(rng)) for frame in frames]
         canvases = np.stack([photographed(canvas, config.light, rng) for canvas, _ in drawn])
         return torch.from_numpy(canvases), *_stacked([target for _, target in drawn])
 
@@ -117,6 +116,14 @@ def lateral_errors(answer: Answer, targets: dict[str, Tensor]) -> dict[str, floa
     error = 640.0 * (answer.columns @ at_shares().T - targets["columns"]).abs()
     known = targets["known"] >= 1.0
     return {place: float(error[:, :, i][known[:, :, i]].mean()) for place, i in _TOLD.items()}
+
+
+def drawn_frames(frames: Sequence[RoadFrame], count: int, rng: np.random.Generator) -> list[RoadFrame]:
+    """`count` random frames; a drive is drawn by the square root of its frames, so that a long one does not rule."""
+    groups = np.array([frame.group for frame in frames])
+    _, index, sizes = np.unique(groups, return_inverse=True, return_counts=True)
+    shares = 1.0 / np.sqrt(sizes[index])
+    return [frames[int(i)] for i in rng.choice(len(frames), size=count, p=shares / shares.sum())]
 
 
 def starting_regressor(config: RegressorConfig) -> LaneRegressor:
