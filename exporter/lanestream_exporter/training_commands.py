@@ -17,7 +17,6 @@ from lanestream_exporter.training.device import best_device, described
 from lanestream_exporter.training.framesources import frame_sources
 from lanestream_exporter.training.loop import Progress as Learnt
 from lanestream_exporter.training.loop import Run, Task
-from lanestream_exporter.training.patchfiles import remember_files
 from lanestream_exporter.training.regressor import RegressorConfig, RegressorTask, starting_regressor
 from lanestream_exporter.training.sources import origin_of, patch_files
 
@@ -50,7 +49,6 @@ def classifier(config: Path, folder: Path, data: Path | None, patches: Path | No
     network = starting_network(settings)  # what is no checkpoint is told now, not after the patches have been made
     with _bar("rendering") as advance:
         files = patch_files(settings.data, patches or folder / "patches", data, advance)
-    remember_files(folder, files)
     sources = [part.read() for part in files]
     for source in sources:
         click.echo(f"{source.name}: {len(source.train)} patches to train on, {len(source.check)} to validate with")

@@ -13,35 +13,42 @@ from lanestream_exporter.datasets.splits import refuse_leak, split_by_group
 from lanestream_exporter.rendering import labelled_store
 from lanestream_exporter.training.config import Frames, PatchData
 
+FrameStream = Iterator[tuple[LabelledFrame, Image]]
+
+
+def own_frames(data: PatchData) -> tuple[FrameStream, FrameStream]:
+    """The frames that `data` names, with their BGR pictures: to train on, and to validate with.
+
+    Raises LabelError for a record that can't be used, and where a drive or clip is on both sides.
+    """
+    groups = [frame.group for frame, _ in _frames(data.train)]
+    if not data.validation:
+        split = split_by_group(groups, data.validation_share)
+        return _of(data.train, split.train), _of(data.train, split.validation)
+    refuse_leak(groups, [frame.group for frame, _ in _frames(data.validation)])
+    return _frames(data.train), _frames(data.validation)
+
 
 def own_stores(data: PatchData, folder: Path) -> tuple[Path, Path]:
-    """Files of patches in `folder` from the frames that `data` names: to train on, and to validate with.
+    """Files in `folder` with patches of the frames that `data` names: to train on, and to validate with.
 
-    They are cut anew where the frames have changed. Raises LabelError for a record that can't be used, and where a
-    drive or clip is on both sides.
+    They are cut anew where the frames have changed. Raises LabelError as `own_frames` does.
     """
     key = _fingerprint(data)
     train, check = (folder / f"own-{use}-{key}.npz" for use in ("train", "validation"))
     if not (train.exists() and check.exists()):
-        groups = [frame.group for frame, _ in _frames(data.train)]
-        if data.validation:
-            validation_groups = [frame.group for frame, _ in _frames(data.validation)]
-            refuse_leak(groups, validation_groups)
-            learnt, kept = set(groups), set(validation_groups)
-        else:
-            split = split_by_group(groups, data.validation_share)
-            learnt, kept = set(split.train), set(split.validation)
-        labelled_store(train, _of(data.train, learnt), to_train=True)
-        labelled_store(check, _of(data.validation or data.train, kept), to_train=False)
+        to_train, to_check = own_frames(data)
+        labelled_store(train, to_train, to_train=True)
+        labelled_store(check, to_check, to_train=False)
     return train, check
 
 
-def _frames(sources: Sequence[Frames]) -> Iterator[tuple[LabelledFrame, Image]]:
+def _frames(sources: Sequence[Frames]) -> FrameStream:
     for source in sources:
         yield from read_dataset(Path(source.path), source.format)
 
 
-def _of(sources: Sequence[Frames], groups: Collection[str]) -> Iterator[tuple[LabelledFrame, Image]]:
+def _of(sources: Sequence[Frames], groups: Collection[str]) -> FrameStream:
     return ((frame, image) for frame, image in _frames(sources) if frame.group in groups)
 
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from lanestream.errors import LabelError
 from lanestream_exporter.patchstore import PatchStore, read_stores
-
-_LIST = "patches.json"
 
 
 @dataclass(frozen=True)
@@ -52,31 +48,3 @@ class PatchFiles:
     def read(self) -> PatchSource:
         """The patches in the files. Raises LabelError where there are too few."""
         return PatchSource(self.name, read_stores(self.train), read_stores(self.check))
-
-
-def remember_files(run: Path, files: Sequence[PatchFiles]) -> None:
-    """Notes in the folder of a run which patches it learns from."""
-    run.mkdir(parents=True, exist_ok=True)
-    noted = {part.name: {"train": _names(part.train), "check": _names(part.check)} for part in files}
-    (run / _LIST).write_text(json.dumps(noted, indent=2) + "\n", encoding="utf-8")
-
-
-def patches_of_run(run: Path) -> tuple[PatchStore, PatchStore] | None:
-    """Patches that a run was trained on and those that it was validated with, real ones where it had any.
-
-    None where `run` is no folder of a classifier's run. Raises LabelError where its patches are gone.
-    """
-    path = run / _LIST
-    if not path.is_file():
-        return None
-    try:
-        noted = json.loads(path.read_text(encoding="utf-8"))
-        part = noted["real"] if "real" in noted else noted["rendered"]
-        train, check = (tuple(Path(name) for name in part[use]) for use in ("train", "check"))
-    except (ValueError, KeyError, TypeError) as error:
-        raise LabelError(f"{path} is not a list of patches", "train again to have it written anew") from error
-    return read_stores(train), read_stores(check)
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    return [str(path.absolute()) for path in paths]
