@@ -21,6 +21,8 @@ WAIT_S = 10.0  # far more than anything takes; a test that hangs fails instead
 class FakeDetector:
     """Sees the two boundaries of a straight ego lane in every frame; fails at a frame that is white all over."""
 
+    slopes: tuple[float, ...] = (-1.15, 1.15)
+
     def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
         height, width = image.shape[:2]
         view = RoadView(width, height, 0.4 * height if horizon is None else horizon)
@@ -30,12 +32,18 @@ class FakeDetector:
         if prepared.image.min() == 255:
             raise RuntimeError("a detector's own mistake")
         found = []
-        for b in (-1.15, 1.15):
+        for b in self.slopes:
             curve = Curve(prepared.view.horizon, ((prepared.view.width - 1) / 2, b, 0.0))
             rows = visible_rows(curve, prepared.view, 0.1)
             assert rows is not None
             found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9))
         return Findings(tuple(found), prepared.view, prepared.horizon_weight)
+
+
+class LeftDetector(FakeDetector):
+    """Sees the left one of them alone."""
+
+    slopes = (-1.15,)
 
 
 class FakeNetwork:
@@ -48,6 +56,13 @@ class FakeNetwork:
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         return np.full((len(inputs), 2), 0.5, np.float32)
+
+
+class OtherNetwork(FakeNetwork):
+    """Answers at once, by another name."""
+
+    name = "other 2"
+    metadata: dict[str, Any] = {"kind": "other fake"}  # noqa: RUF012
 
 
 class GatedNetwork(FakeNetwork):
@@ -74,6 +89,11 @@ class GatedNetwork(FakeNetwork):
 def engine(network: FakeNetwork | None = None) -> Engine:
     """An engine of fakes."""
     return Engine([Pipeline("candidates", FakeDetector(), network or FakeNetwork())])
+
+
+def two_detectors() -> Engine:
+    """An engine of fakes with both detectors: `candidates`, the default, and `regression`, which sees less."""
+    return Engine([*engine().pipelines, Pipeline("regression", LeftDetector(), OtherNetwork())])
 
 
 def image_file(kind: str = ".jpg", width: int = 320, height: int = 180, shade: int | None = None) -> bytes:

@@ -14,7 +14,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
-from lanestream.protocol import SUBPROTOCOL, LanesMessage, Mode, ReadyMessage, SummaryMessage
+from lanestream.protocol import SUBPROTOCOL, DetectorName, LanesMessage, Mode, ReadyMessage, SummaryMessage
 from lanestream_client import requests
 from lanestream_client.conversation import Conversation, lost
 from lanestream_client.endpoint import Endpoint
@@ -47,25 +47,39 @@ class AsyncLaneClient:
         """Closes the connections that are kept for further requests."""
         await self._http.aclose()
 
-    async def describe(self) -> ServiceInfo:
-        """The model that the service runs, and what runs it."""
+    async def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
+        """The model that the service runs for a detector, for its default one where None, and what runs it."""
         with requests.reaching(self._endpoint.base):
-            return requests.info_of(await self._http.get("/v1/models"))
+            return requests.info_of(await self._http.get("/v1/models"), detector)
 
-    async def detect(self, image: bytes | str | Path, *, horizon: float | None = None) -> LanesMessage:
-        """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height."""
+    async def detect(
+        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+    ) -> LanesMessage:
+        """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height.
+
+        `detector` says what finds them, the service's default where None.
+        """
         data = await asyncio.to_thread(requests.image_bytes, image)
         with requests.reaching(self._endpoint.base):
-            response = await self._http.post("/v1/detect", content=data, params=requests.parameters(horizon))
+            query = requests.parameters(horizon, detector)
+            response = await self._http.post("/v1/detect", content=data, params=query)
         return requests.lanes_of(response)
 
-    def stream(self, frames: Frames, *, mode: Mode = "latest", horizon: float | None = None) -> AsyncLaneStream:
+    def stream(
+        self,
+        frames: Frames,
+        *,
+        mode: Mode = "latest",
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+    ) -> AsyncLaneStream:
         """The lanes of the frames of one camera, in their order, as they come; see LaneClient.stream.
 
         A source that is no async iterable is read in a thread, because it may block.
         """
         source = frames if isinstance(frames, AsyncIterable) else _in_thread(frames)
-        return AsyncLaneStream(self._endpoint, source, Conversation(mode, horizon, self._in_flight), self._timeout)
+        conversation = Conversation(mode, horizon, detector, in_flight=self._in_flight)
+        return AsyncLaneStream(self._endpoint, source, conversation, self._timeout)
 
 
 class AsyncLaneStream:

@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from lanestream.protocol import SUBPROTOCOL, LanesMessage, Mode, ReadyMessage, SummaryMessage
+from lanestream.protocol import SUBPROTOCOL, DetectorName, LanesMessage, Mode, ReadyMessage, SummaryMessage
 from lanestream_client import requests
 from lanestream_client.conversation import Conversation, lost
 from lanestream_client.endpoint import Endpoint
@@ -49,27 +49,37 @@ class LaneClient:
         """Closes the connections that are kept for further requests."""
         self._http.close()
 
-    def describe(self) -> ServiceInfo:
-        """The model that the service runs, and what runs it."""
+    def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
+        """The model that the service runs for a detector, for its default one where None, and what runs it."""
         with requests.reaching(self._endpoint.base):
-            return requests.info_of(self._http.get("/v1/models"))
+            return requests.info_of(self._http.get("/v1/models"), detector)
 
-    def detect(self, image: bytes | str | Path, *, horizon: float | None = None) -> LanesMessage:
-        """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height."""
+    def detect(
+        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+    ) -> LanesMessage:
+        """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height.
+
+        `detector` says what finds them, the service's default where None.
+        """
         data = requests.image_bytes(image)
         with requests.reaching(self._endpoint.base):
-            return requests.lanes_of(self._http.post("/v1/detect", content=data, params=requests.parameters(horizon)))
+            query = requests.parameters(horizon, detector)
+            return requests.lanes_of(self._http.post("/v1/detect", content=data, params=query))
 
     def stream(
-        self, frames: Iterable[SourceFrame | bytes], *, mode: Mode = "latest", horizon: float | None = None
+        self,
+        frames: Iterable[SourceFrame | bytes],
+        *,
+        mode: Mode = "latest",
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
     ) -> LaneStream:
-        """The lanes of the frames of one camera, in their order, as they come.
+        """The lanes of the frames of one camera, in their order, as they come; `detector` as for `detect`.
 
         A frame that the service refuses gives a result with an `error`, and the stream goes on.
         """
-        return LaneStream(
-            self._endpoint, as_frames(frames), Conversation(mode, horizon, self._in_flight), self._timeout
-        )
+        conversation = Conversation(mode, horizon, detector, in_flight=self._in_flight)
+        return LaneStream(self._endpoint, as_frames(frames), conversation, self._timeout)
 
 
 class LaneStream:

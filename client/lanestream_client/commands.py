@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +26,13 @@ from lanestream_client.sinks import json_lines, video_sink
 from lanestream_client.sources import image_files, open_source
 
 if TYPE_CHECKING:
-    from lanestream.protocol import LanesMessage, Mode
+    from lanestream.protocol import DetectorName, LanesMessage, Mode
     from lanestream_client.frames import StreamResult
-    from lanestream_client.service import LaneService
+    from lanestream_client.service import LaneService, ResultStream
     from lanestream_client.sinks import JsonLines, VideoSink
     from lanestream_client.sources import Source
 
-Load = Callable[[Path | None, str], LocalEngine]
+Load = Callable[[Path | None, str, Path | None], LocalEngine]
 _Command = Callable[..., None]
 _INTERRUPTED = 130
 
@@ -41,9 +42,20 @@ def _service_options(command: _Command) -> _Command:
         click.option("--url", help="Service to ask, such as http://127.0.0.1:8000  [default: work in this process]"),
         click.option("--model", type=click.Path(path_type=Path), help="ONNX file to run in this process."),
         click.option(
+            "--regressor",
+            type=click.Path(path_type=Path),
+            metavar="FILE|none",
+            help="ONNX file of the second network in this process, or none  [default: the shipped one]",
+        ),
+        click.option(
             "--provider",
             type=click.Choice(["auto", "cpu", "cuda"]),
-            help="What runs it in this process  [default: auto]",
+            help="What runs them in this process  [default: auto]",
+        ),
+        click.option(
+            "--detector",
+            type=click.Choice(["candidates", "regression"]),
+            help="What finds the lanes  [default: that of the model]",
         ),
         click.option(
             "--horizon",
@@ -68,6 +80,7 @@ def detect(
     context: click.Context,
     /,
     paths: tuple[Path, ...],
+    detector: DetectorName | None,
     horizon: float | None,
     jsonl: Path | None,
     annotate: Path | None,
@@ -78,10 +91,11 @@ def detect(
     tally = Tally()
     with ExitStack() as stack:
         service = stack.enter_context(_service(context.obj, **where))
+        lanes_of = partial(service.detect, horizon=horizon, detector=detector)
         lines = stack.enter_context(json_lines(jsonl))
         advance = stack.enter_context(_progress("images", len(files)))
         for path in files:
-            lanes = _detected(service, path, horizon)
+            lanes = _detected(lanes_of, path)
             advance()
             if lanes is None:
                 tally.fail()
@@ -93,7 +107,7 @@ def detect(
                 lines.write(lanes, file=str(path))
             if annotate is not None:
                 _annotate(path, lanes, annotate)
-        click.echo(f"\n{tally.report(service.describe())}", err=_is_output(jsonl))
+        click.echo(f"\n{tally.report(service.describe(detector))}", err=_is_output(jsonl))
     context.exit(1 if tally.failed else 0)
 
 
@@ -112,6 +126,7 @@ def stream(
     context: click.Context,
     /,
     source: str,
+    detector: DetectorName | None,
     horizon: float | None,
     jsonl: Path | None,
     mode: Mode | None,
@@ -128,8 +143,10 @@ def stream(
         service = stack.enter_context(_service(context.obj, **where))
         lines = stack.enter_context(json_lines(jsonl))
         outputs = _Outputs(lines, stack.enter_context(video_sink(video, camera.fps)))
-        interrupted = _follow(service, camera, outputs, mode or ("latest" if camera.live else "all"), horizon)
-        click.echo(outputs.tally.report(service.describe(), outputs.dropped), err=_is_output(jsonl))
+        mode = mode or ("latest" if camera.live else "all")
+        follow = partial(service.stream, mode=mode, horizon=horizon, detector=detector)
+        interrupted = _follow(follow, camera, outputs, mode)
+        click.echo(outputs.tally.report(service.describe(detector), outputs.dropped), err=_is_output(jsonl))
     context.exit(_INTERRUPTED if interrupted else 0)
 
 
@@ -167,14 +184,14 @@ class _Outputs:
             video.write(image, result.frame.timestamp)
 
 
-def _follow(service: LaneService, camera: Source, outputs: _Outputs, mode: Mode, horizon: float | None) -> bool:
+def _follow(stream: Callable[..., ResultStream], camera: Source, outputs: _Outputs, mode: Mode) -> bool:
     """Takes the camera's frames to `outputs`. True where the user broke it off, which is how a live one ends."""
     with ExitStack() as stack:
         advance = stack.enter_context(_progress("frames", camera.length))
         newest = None
         if camera.live and mode == "latest":
             newest = stack.enter_context(NewestFrames(camera.frames))
-        results = service.stream(newest or camera.frames, mode=mode, horizon=horizon)
+        results = stream(newest or camera.frames)
         interrupted = False
         try:
             with closing(iter(results)) as each:
@@ -188,12 +205,16 @@ def _follow(service: LaneService, camera: Source, outputs: _Outputs, mode: Mode,
 
 
 @contextmanager
-def _service(load: Load, url: str | None, model: Path | None, provider: str | None) -> Iterator[LaneService]:
+def _service(
+    load: Load, url: str | None, model: Path | None, provider: str | None, regressor: Path | None
+) -> Iterator[LaneService]:
     if url is None:
-        yield InProcess(load(model, provider or "auto"))
+        yield InProcess(load(model, provider or "auto", regressor))
         return
-    if model is not None or provider is not None:
-        raise click.UsageError("--model and --provider are for work in this process; the service at --url has its own")
+    if any(option is not None for option in (model, provider, regressor)):
+        raise click.UsageError(
+            "--model, --regressor and --provider are for work in this process; the service at --url has its own"
+        )
     with LaneClient(url) as client:
         yield client
 
@@ -212,10 +233,10 @@ def _files(paths: Sequence[Path]) -> list[Path]:
     return [file for path in paths for file in (image_files(path) if path.is_dir() else [path])]
 
 
-def _detected(service: LaneService, path: Path, horizon: float | None) -> LanesMessage | None:
+def _detected(lanes_of: Callable[[bytes], LanesMessage], path: Path) -> LanesMessage | None:
     """The lanes of an image; None, with a line about why, where that image has none to give."""
     try:
-        return service.detect(image_bytes(path), horizon=horizon)
+        return lanes_of(image_bytes(path))
     except ImageError as error:
         click.echo(f"error: {path}: {error}", err=True)
     except SourceError as error:

@@ -6,6 +6,7 @@ which pays only where the network is slower than the service. None has to be dro
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -18,15 +19,16 @@ from lanestream.errors import (
     error_of,
 )
 from lanestream.protocol import (
+    DetectorName,
     EndMessage,
     ErrorMessage,
     FrameMessage,
     LanesMessage,
     Mode,
     ReadyMessage,
-    StartMessage,
     SummaryMessage,
     error_message,
+    parse_client_message,
     parse_server_message,
 )
 from lanestream_client.frames import SourceFrame, StreamResult
@@ -49,18 +51,22 @@ class Conversation:
     None of its methods waits; calls from several threads need a lock around them.
     """
 
-    def __init__(self, mode: Mode, horizon: float | None = None, in_flight: int = 1) -> None:
+    def __init__(
+        self, mode: Mode, horizon: float | None = None, detector: DetectorName | None = None, *, in_flight: int = 1
+    ) -> None:
         self.ready: ReadyMessage | None = None
         self.summary: SummaryMessage | None = None
         self._mode = mode
         self._horizon = horizon
+        self._detector = detector
         self._in_flight = in_flight
         self._pending: dict[int, _Pending] = {}
         self._last_seq = -1
 
     def opening(self) -> str:
-        """The message that opens the stream."""
-        return StartMessage(mode=self._mode, horizon=self._horizon).model_dump_json()
+        """The message that opens the stream. Raises ProtocolError where something was asked for that is none."""
+        asked = {"type": "start", "mode": self._mode, "detector": self._detector, "horizon": self._horizon}
+        return parse_client_message(json.dumps(asked)).model_dump_json(exclude_none=True)
 
     def opened(self, text: str | bytes) -> ReadyMessage:
         """Takes the service's answer to the opening. Raises the error that it tells, ProtocolError where it is odd."""

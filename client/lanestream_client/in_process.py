@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from lanestream.errors import LanestreamError
-from lanestream.protocol import LanesMessage, Mode, SummaryMessage, error_message
+from lanestream.protocol import DetectorName, LanesMessage, Mode, SummaryMessage, error_message
 from lanestream_client.frames import SourceFrame, StreamResult
 from lanestream_client.requests import image_bytes
 from lanestream_client.service import ServiceInfo, as_frames
@@ -25,11 +25,11 @@ class Camera(Protocol):
         ...
 
 
-class LocalEngine(Protocol):
-    """An engine of this process."""
+class Network(Protocol):
+    """A network of this process."""
 
     @property
-    def model(self) -> str:
+    def name(self) -> str:
         """The model's name and version."""
         ...
 
@@ -38,7 +38,15 @@ class LocalEngine(Protocol):
         """The execution provider that really runs it."""
         ...
 
-    def open_camera(self, horizon: float | None = None) -> Camera:
+
+class LocalEngine(Protocol):
+    """An engine of this process."""
+
+    def network(self, detector: DetectorName | None = None) -> Network:
+        """The network of a detector, of the default one where None."""
+        ...
+
+    def open_camera(self, horizon: float | None = None, detector: DetectorName | None = None) -> Camera:
         """A session for one camera."""
         ...
 
@@ -49,20 +57,31 @@ class InProcess:
     def __init__(self, engine: LocalEngine) -> None:
         self._engine = engine
 
-    def describe(self) -> ServiceInfo:
-        """The model, and what runs it."""
-        return ServiceInfo(self._engine.model, self._engine.provider)
+    def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
+        """The model of a detector, of the default one where None, and what runs it. Raises NoDetectorError."""
+        network = self._engine.network(detector)
+        return ServiceInfo(network.name, network.provider)
 
-    def detect(self, image: bytes | str | Path, *, horizon: float | None = None) -> LanesMessage:
-        """The lanes of one image file. Raises ImageError and SourceError."""
-        return self._engine.open_camera(horizon).lanes(image_bytes(image), seq=0, timestamp=0.0)
+    def detect(
+        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+    ) -> LanesMessage:
+        """The lanes of one image file. Raises ImageError, SourceError and NoDetectorError."""
+        return self._engine.open_camera(horizon, detector).lanes(image_bytes(image), seq=0, timestamp=0.0)
 
     def stream(
-        self, frames: Iterable[SourceFrame | bytes], *, mode: Mode = "latest", horizon: float | None = None
+        self,
+        frames: Iterable[SourceFrame | bytes],
+        *,
+        mode: Mode = "latest",
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
     ) -> LocalStream:
-        """The lanes of the frames of one camera. In either mode a frame is taken when the one before is done."""
+        """The lanes of the frames of one camera. In either mode a frame is taken when the one before is done.
+
+        Raises NoDetectorError where `detector` is not loaded.
+        """
         del mode  # nothing waits here that a newer frame could replace
-        return LocalStream(self._engine.open_camera(horizon), as_frames(frames))
+        return LocalStream(self._engine.open_camera(horizon, detector), as_frames(frames))
 
 
 class LocalStream:

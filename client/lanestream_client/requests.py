@@ -11,8 +11,15 @@ from typing import Any
 import httpx
 from pydantic import ValidationError
 
-from lanestream.errors import ConnectionFailedError, LanestreamError, ProtocolError, SourceError, error_of
-from lanestream.protocol import LanesMessage
+from lanestream.errors import (
+    ConnectionFailedError,
+    LanestreamError,
+    NoDetectorError,
+    ProtocolError,
+    SourceError,
+    error_of,
+)
+from lanestream.protocol import DetectorName, LanesMessage
 from lanestream_client.service import ServiceInfo
 
 
@@ -26,9 +33,10 @@ def image_bytes(image: bytes | str | Path) -> bytes:
         raise SourceError(f"can't read {image}: {(error.strerror or str(error)).lower()}") from None
 
 
-def parameters(horizon: float | None) -> dict[str, float]:
+def parameters(horizon: float | None, detector: DetectorName | None) -> dict[str, float | str]:
     """The query of a request."""
-    return {} if horizon is None else {"horizon": horizon}
+    given = {"horizon": horizon, "detector": detector}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def lanes_of(response: httpx.Response) -> LanesMessage:
@@ -39,13 +47,20 @@ def lanes_of(response: httpx.Response) -> LanesMessage:
         raise ProtocolError("the service answered with something unknown") from None
 
 
-def info_of(response: httpx.Response) -> ServiceInfo:
-    """What runs, in an answer of `/v1/models`. Raises the error that the service told."""
+def info_of(response: httpx.Response, detector: DetectorName | None) -> ServiceInfo:
+    """What runs, in an answer of `/v1/models`, for a detector; for the default one, which is the first, where None.
+
+    Raises NoDetectorError where the service has not loaded it, and the error that the service told.
+    """
     try:
-        model = checked(response).json()["models"][0]
-        return ServiceInfo(str(model["name"]), str(model["provider"]))
+        models = checked(response).json()["models"]
+        infos = {model["detector"]: ServiceInfo(str(model["name"]), str(model["provider"])) for model in models}
+        default = models[0]["detector"]
     except (ValueError, TypeError, LookupError):
         raise ProtocolError("the service answered with something unknown") from None
+    if detector not in (None, *infos):
+        raise NoDetectorError(f"the service has no detector {detector}", f"ask for {', '.join(infos)}")
+    return infos[detector or default]
 
 
 def checked(response: httpx.Response) -> httpx.Response:

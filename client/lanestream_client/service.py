@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from lanestream.protocol import LanesMessage, Mode, SummaryMessage
+from lanestream.protocol import DetectorName, LanesMessage, Mode, SummaryMessage
 from lanestream_client.frames import SourceFrame, StreamResult
 
 
@@ -33,16 +33,23 @@ class ResultStream(Protocol):
 class LaneService(Protocol):
     """What finds lanes."""
 
-    def describe(self) -> ServiceInfo:
-        """What runs."""
+    def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
+        """What runs, for a detector; for the default one where None."""
         ...
 
-    def detect(self, image: bytes | str | Path, *, horizon: float | None = None) -> LanesMessage:
+    def detect(
+        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+    ) -> LanesMessage:
         """The lanes of one image file."""
         ...
 
     def stream(
-        self, frames: Iterable[SourceFrame | bytes], *, mode: Mode = "latest", horizon: float | None = None
+        self,
+        frames: Iterable[SourceFrame | bytes],
+        *,
+        mode: Mode = "latest",
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
     ) -> ResultStream:
         """The lanes of the frames of one camera."""
         ...

@@ -89,18 +89,25 @@ def cli(context: click.Context) -> None:
 @click.option("--host", help="Address to listen on  [default: 127.0.0.1]")
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]")
 @click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
-@click.option("--provider", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network runs  [default: auto]")
+@click.option(
+    "--regressor",
+    type=click.Path(path_type=Path),
+    metavar="FILE|none",
+    help="ONNX file of the second network, or none  [default: the shipped one]",
+)
+@click.option("--provider", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the networks run  [default: auto]")
 @click.option("--max-sessions", type=click.IntRange(1), help="Streams at a time at most  [default: 64]")
 def serve(**given: Any) -> None:
     """Serve lanes over HTTP and WebSockets. Everything can also be set by LANESTREAM_<NAME>."""
     with needs_extra("service,cpu"):
         # The image module comes first, because OpenCV reads its limit once.
         from lanestream.api.server import serve as run
-        from lanestream.engine import load_engine
+        from lanestream.engine import chosen_regressor, load_engine
         from lanestream.settings import load_settings
         from lanestream_client.overlays import draw_lanes
     settings = load_settings(**given)
-    run(settings, lambda: load_engine(settings.model, settings.provider), draw_lanes)
+    regressor = chosen_regressor(settings.regressor)
+    run(settings, lambda: load_engine(settings.model, settings.provider, regressor), draw_lanes)
 
 
 def main() -> None:
@@ -125,10 +132,10 @@ def main() -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _load_local(model: Path | None, provider: Provider) -> LocalEngine:
+def _load_local(model: Path | None, provider: Provider, regressor: Path | None) -> LocalEngine:
     with needs_extra("service,cpu"):
         from lanestream.local import LocalEngine
-    return LocalEngine.load(model, provider)
+    return LocalEngine.load(model, provider, regressor)
 
 
 if __name__ == "__main__":

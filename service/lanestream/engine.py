@@ -23,6 +23,8 @@ from lanestream.sessions import Session
 # The networks that are shipped, and served where no others are named.
 SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
 SHIPPED_REGRESSOR: Final = Path(__file__).parent / "models" / "regressor.onnx"
+# The regressor beside the model where none is named.
+DEFAULT_REGRESSOR: Final[Path | None] = None
 
 
 class Engine:
@@ -82,6 +84,10 @@ def load_engine(model: Path | None = None, provider: Provider = "auto", regresso
     """
     network = _warm(model or SHIPPED_MODEL, provider)
     if isinstance(network.info, RegressorInfo):
+        if regressor not in (None, DEFAULT_REGRESSOR):
+            raise ModelError(
+                f"{model} is a regressor itself", f"leave {regressor} out, or give a classifier as the model"
+            )
         return Engine([Pipeline("regression", _regression(network.info), network)])
     if regressor is None:
         return Engine([Pipeline("candidates", _candidates(network.info, None), network)])
@@ -95,6 +101,13 @@ def load_engine(model: Path | None = None, provider: Provider = "auto", regresso
             Pipeline("regression", glance.detector, other),
         ]
     )
+
+
+def chosen_regressor(named: Path | None) -> Path | None:
+    """The file that users mean by `named`: the default one where they name none, and no file by the name `none`."""
+    if named is None:
+        return DEFAULT_REGRESSOR
+    return None if named == Path("none") else named
 
 
 def _warm(path: Path, provider: Provider) -> OnnxModel:

@@ -143,6 +143,7 @@ _ANSWERS: Final[dict[str, Answer]] = {
     ImageError.code: Answer(415, 1003),
     ImageTooLargeError.code: Answer(413, 1009),
     ProtocolError.code: Answer(422, 1002),
+    NoDetectorError.code: Answer(422, 1008),
     OverrunError.code: Answer(429, 1008),
     BusyError.code: Answer(503, 1013),
     NotReadyError.code: Answer(503, 1013),

@@ -6,17 +6,19 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from lanestream.engine import load_engine
+from lanestream.engine import chosen_regressor, load_engine
 from lanestream.imaging import MOST_PIXELS, ImageLimits, decode
 from lanestream.messages import ProcessedFrame, lanes_message
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from lanestream.detection import DetectorName, Network
     from lanestream.engine import Engine
     from lanestream.inference.providers import Provider
     from lanestream.lanes import Image
     from lanestream.protocol import LanesMessage
+    from lanestream.sessions import Session
 
 # Who decodes a file of their own may give it more memory than a service gives to strangers.
 _LIMITS: Final = ImageLimits(max_bytes=1 << 28, max_pixels=MOST_PIXELS)
@@ -29,31 +31,31 @@ class LocalEngine:
         self._engine = engine
 
     @classmethod
-    def load(cls, model: Path | None, provider: Provider) -> LocalEngine:
-        """The engine for a model file, the shipped one where None. Raises ModelError and ProviderError."""
-        return cls(load_engine(model, provider))
+    def load(cls, model: Path | None, provider: Provider, regressor: Path | None = None) -> LocalEngine:
+        """The engine for a model file and the regressor beside it, the shipped ones where None.
 
-    @property
-    def model(self) -> str:
-        """The model's name and version."""
-        return self._engine.network.name
+        The path `none` goes without a regressor. Raises ModelError and ProviderError.
+        """
+        return cls(load_engine(model, provider, chosen_regressor(regressor)))
 
-    @property
-    def provider(self) -> str:
-        """The execution provider that really runs it."""
-        return self._engine.network.provider
+    def network(self, detector: DetectorName | None = None) -> Network:
+        """The network of a detector, of the default one where None. Raises NoDetectorError where it is not loaded."""
+        return self._engine.pipeline(detector).network
 
-    def open_camera(self, horizon: float | None = None) -> LocalCamera:
-        """Lanes for the frames of one camera; `horizon` as a share of the image height, estimated where None."""
-        return LocalCamera(self._engine, horizon)
+    def open_camera(self, horizon: float | None = None, detector: DetectorName | None = None) -> LocalCamera:
+        """Lanes for the frames of one camera; `horizon` as a share of the image height, estimated where None.
+
+        Raises NoDetectorError where `detector` is not loaded.
+        """
+        return LocalCamera(self._engine, self._engine.open_session(horizon, detector))
 
 
 class LocalCamera:
     """One camera's session."""
 
-    def __init__(self, engine: Engine, horizon: float | None) -> None:
+    def __init__(self, engine: Engine, session: Session) -> None:
         self._engine = engine
-        self._session = engine.open_session(horizon)
+        self._session = session
 
     def lanes(self, image: bytes | Image, *, seq: int, timestamp: float) -> LanesMessage:
         """The lanes of one frame: an image file, or BGR pixels (H, W, 3) uint8; `timestamp` in seconds.

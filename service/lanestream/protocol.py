@@ -16,6 +16,7 @@ SUBPROTOCOL: Final = "lanestream.v1"
 
 Point = tuple[float, float]
 Mode = Literal["latest", "all"]
+DetectorName = Literal["candidates", "regression"]
 
 
 class Message(BaseModel):
@@ -29,7 +30,9 @@ class StartMessage(Message):
 
     type: Literal["start"] = "start"
     mode: Mode = "latest"
-    detector: Literal["candidates"] = "candidates"
+    detector: DetectorName | None = Field(
+        default=None, description="What finds the lanes; the service's default where absent."
+    )
     horizon: Annotated[float, Field(gt=0.0, lt=1.0)] | None = Field(
         default=None, description="Row of the horizon as a share of the image height; estimated where absent."
     )

@@ -28,7 +28,10 @@ class Settings(BaseSettings):
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     model: Path | None = Field(default=None, description="ONNX file of the network; the shipped one where absent.")
-    provider: Literal["auto", "cpu", "cuda"] = Field(default="auto", description="Where the network runs.")
+    regressor: Path | None = Field(
+        default=None, description="ONNX file of the second network, or `none`; the shipped one where absent."
+    )
+    provider: Literal["auto", "cpu", "cuda"] = Field(default="auto", description="Where the networks run.")
     max_bytes: int = Field(default=8 << 20, ge=1024, le=1 << 28, description="Bytes of one image file at most.")
     max_pixels: int = Field(default=4096 * 2304, ge=1 << 16, le=MOST_PIXELS, description="Pixels of one image at most.")
     max_sessions: int = Field(default=64, ge=1, description="Streams and single images at a time at most.")

@@ -51,6 +51,13 @@ def url() -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
+def both_url() -> Iterator[str]:
+    """A server with an engine of fakes that has both detectors."""
+    with serving(fakes.two_detectors(), Settings()) as place:
+        yield place
+
+
+@pytest.fixture(scope="session")
 def real_engine() -> Engine:
     """The shipped network on the CPU."""
     return load_engine(None, "cpu")

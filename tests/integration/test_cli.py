@@ -31,6 +31,9 @@ Run = Callable[..., tuple[int, str, str]]
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
     """Runs `lanestream` in this process and an empty folder, with an engine of fakes: (exit code, output, errors)."""
 
+    def loaded(regressor: Path | None) -> Engine:
+        return fakes.engine() if regressor == Path("none") else fakes.two_detectors()
+
     def called(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["lanestream", *map(str, arguments)])
         with pytest.raises(SystemExit) as caught:
@@ -40,7 +43,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
         return int(caught.value.code or 0), output, errors
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider: LocalEngine(fakes.engine()))
+    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider, regressor: LocalEngine(loaded(regressor)))
     return called
 
 
@@ -121,6 +124,29 @@ def test_stream_through_a_service(run: Run, clip: Path, url: str, mode: str) -> 
     assert "model fake 1 on cpu" in output
 
 
+@pytest.mark.parametrize(("detector", "count", "model"), [("candidates", 2, "fake 1"), ("regression", 1, "other 2")])
+@pytest.mark.parametrize("remote", [False, True])
+def test_the_detector_can_be_chosen(
+    run: Run, clip: Path, both_url: str, detector: str, count: int, model: str, remote: bool
+) -> None:
+    where = ["--url", both_url] if remote else []
+    code, output, _ = run("stream", clip, "--detector", detector, "--jsonl", "lanes.jsonl", *where)
+    assert (code, f"model {model} on cpu" in output) == (0, True)
+    assert [len(line["lanes"]) for line in lines_of(Path("lanes.jsonl"))] == [count] * 10
+    Path("a.jpg").write_bytes(fakes.image_file())
+    code, output, _ = run("detect", "a.jpg", "--detector", detector, *where)
+    assert (code, f"model {model} on cpu" in output) == (0, True)
+    assert f"a.jpg: {count} " in output
+
+
+def test_a_detector_that_is_not_there_is_told_in_a_line(run: Run, clip: Path, url: str) -> None:
+    Path("a.jpg").write_bytes(fakes.image_file())
+    told = "error: there is no detector regression here (ask for candidates)\n"
+    for where in (["--url", url], ["--regressor", "none"]):
+        for command in (["stream", clip], ["detect", "a.jpg"]):
+            assert run(*command, "--detector", "regression", *where) == (1, "", told)
+
+
 def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
@@ -161,7 +187,9 @@ def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_
         (["stream", "clip.mp4", "--url", "x", "--model", "m.onnx"], 2, "Usage:"),
         (["stream", "clip.mp4", "--video", "/dev/null/x.mp4"], 1, "error: can't write /dev/null/x.mp4: "),
         (["stream", "clip.mp4", "--jsonl", "/dev/null/x.jsonl"], 1, "error: can't write /dev/null/x.jsonl: "),
+        (["stream", "clip.mp4", "--url", "x", "--regressor", "none"], 2, "Usage:"),
         (["stream", "clip.mp4", "--mode", "some"], 2, "Usage:"),
+        (["stream", "clip.mp4", "--detector", "guesses"], 2, "Usage:"),
         (["stream"], 2, "Usage:"),
         (["detect", "none.jpg"], 1, "error: can't read none.jpg: no such file or directory"),
         (["detect", "empty"], 1, "error: no image in the folder empty ("),
@@ -200,10 +228,11 @@ def test_a_bad_variable_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> No
     assert errors.startswith("error: LANESTREAM_PORT = 'many': input should be a valid integer")
 
 
+@pytest.mark.parametrize("option", ["--model", "--regressor"])
 @pytest.mark.parametrize("name", ["model.onnx", "none.onnx"])
-def test_a_model_that_is_none_ends_the_service(run: Run, tmp_path: Path, name: str) -> None:
+def test_a_model_that_is_none_ends_the_service(run: Run, tmp_path: Path, option: str, name: str) -> None:
     (tmp_path / "model.onnx").write_text("no model")
-    code, _, errors = run("serve", "--port", "0", "--model", name)
+    code, _, errors = run("serve", "--port", "0", option, name)
     assert code == 1
     assert errors.splitlines()[-1].startswith("error: ")
     assert name in errors.splitlines()[-1]

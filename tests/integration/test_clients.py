@@ -18,13 +18,16 @@ from lanestream.errors import (
     ConnectionFailedError,
     ImageError,
     ImageTooLargeError,
+    NoDetectorError,
     NotReadyError,
     ProtocolError,
     SettingsError,
     SourceError,
 )
-from lanestream.protocol import Limits, ReadyMessage
+from lanestream.local import LocalEngine
+from lanestream.protocol import LanesMessage, Limits, ReadyMessage
 from lanestream_client import AsyncLaneClient, LaneClient, SourceFrame
+from lanestream_client.in_process import InProcess
 from lanestream_client.service import ServiceInfo
 
 Serve = Callable[..., str]
@@ -33,6 +36,11 @@ Serve = Callable[..., str]
 def frames(count: int) -> Iterator[SourceFrame]:
     data = fakes.image_file()
     return (SourceFrame(seq, 0.04 * seq, data=data, name=f"{seq}.jpg") for seq in range(count))
+
+
+def positions(lanes: LanesMessage | None) -> list[int]:
+    assert lanes is not None
+    return [lane.position for lane in lanes.lanes]
 
 
 @pytest.fixture
@@ -141,6 +149,60 @@ def test_refusals_have_their_types(serve: Serve) -> None:
         with pytest.raises(BusyError):
             list(other.stream([b"x"]))
         holding.close()
+
+
+def test_the_detector_can_be_chosen(both_url: str) -> None:
+    with LaneClient(both_url) as client:
+        assert client.describe() == client.describe("candidates") == ServiceInfo("fake 1", "cpu")
+        assert client.describe("regression") == ServiceInfo("other 2", "cpu")
+        assert positions(client.detect(fakes.image_file(), detector="regression")) == [-1]
+        assert positions(client.detect(fakes.image_file(), detector="candidates")) == [-1, 1]
+        stream = client.stream(frames(3), detector="regression")
+        assert [positions(result.lanes) for result in stream] == [[-1]] * 3
+        assert stream.ready is not None
+        assert (stream.ready.detector, stream.ready.model) == ("regression", "other 2")
+
+
+async def test_the_detector_can_be_chosen_by_the_awaiting_client(both_url: str) -> None:
+    async with AsyncLaneClient(both_url) as client:
+        assert await client.describe("regression") == ServiceInfo("other 2", "cpu")
+        assert positions(await client.detect(fakes.image_file(), detector="regression")) == [-1]
+        one, other = client.stream(frames(3)), client.stream(frames(3), detector="regression")
+        both = zip([result async for result in one], [result async for result in other], strict=True)
+        assert [(positions(a.lanes), positions(b.lanes)) for a, b in both] == [([-1, 1], [-1])] * 3
+
+
+async def test_a_detector_that_is_not_there_has_its_type(url: str) -> None:
+    told = r"no detector regression.*\(ask for candidates\)"
+    with LaneClient(url) as client:
+        for call in (
+            lambda: client.describe("regression"),
+            lambda: client.detect(fakes.image_file(), detector="regression"),
+            lambda: list(client.stream(frames(1), detector="regression")),
+        ):
+            with pytest.raises(NoDetectorError, match=told):
+                call()
+        with pytest.raises(ProtocolError, match="'candidates' or 'regression'"):
+            list(client.stream(frames(1), detector="guesses"))
+    async with AsyncLaneClient(url) as client:
+        with pytest.raises(NoDetectorError, match=told):
+            await client.detect(fakes.image_file(), detector="regression")
+        with pytest.raises(NoDetectorError, match=told):
+            _ = [result async for result in client.stream(frames(1), detector="regression")]
+
+
+def test_the_detector_can_be_chosen_in_process() -> None:
+    local = InProcess(LocalEngine(fakes.two_detectors()))
+    assert local.describe() == ServiceInfo("fake 1", "cpu")
+    assert local.describe("regression") == ServiceInfo("other 2", "cpu")
+    assert positions(local.detect(fakes.image_file())) == [-1, 1]
+    assert positions(local.detect(fakes.image_file(), detector="regression")) == [-1]
+    one, other = local.stream(frames(3)), local.stream(frames(3), detector="regression")
+    both = zip(one, other, strict=True)
+    assert [(positions(a.lanes), positions(b.lanes)) for a, b in both] == [([-1, 1], [-1])] * 3
+    only = InProcess(LocalEngine(fakes.engine()))
+    with pytest.raises(NoDetectorError, match="ask for candidates"):
+        only.stream(frames(1), detector="regression")
 
 
 async def test_the_awaiting_client_does_the_same(url: str, tmp_path: Path) -> None:

@@ -1,20 +1,29 @@
-"""The shipped network behind the service: what goes in at one end comes out at the other."""
+"""Networks from model files behind the service: what goes in at one end comes out at the other."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 
-from lanestream.engine import Engine
+from lanestream.engine import DEFAULT_REGRESSOR, SHIPPED_MODEL, Engine, chosen_regressor, load_engine
+from lanestream.errors import ModelError, NoDetectorError
 from lanestream.imaging import ImageLimits, decode
+from lanestream.inference import CanvasInfo, RegressorInfo
+from lanestream.inference.model_info import METADATA_KEY
+from lanestream.local import LocalEngine
 from lanestream.protocol import LanesMessage
 from lanestream_client import LaneClient, SourceFrame
 from lanestream_client.in_process import InProcess
+from lanestream_client.service import ServiceInfo
 from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
+Serve = Callable[..., str]
 FPS = 25.0
 
 
@@ -23,6 +32,45 @@ def drive() -> list[bytes]:
     """Six frames of a rendered highway, as PNG files, so that nothing is lost on the way."""
     clip = sample_clip(np.random.default_rng(24), 640, 360, frames=6, fps=FPS, drive=Drive("highway", fair=True))
     return [cv2.imencode(".png", frame.image)[1].tobytes() for frame in render_clip(clip)]
+
+
+# A straight road between two boundaries, nearly no doubt, both are there, and the horizon is where it was taken to be.
+READING = [-0.4, -0.16, -0.06, 0.4, 0.16, 0.06, *[0.01] * 6, 0.9, 0.9, 0.0]
+
+
+@pytest.fixture(scope="module")
+def regressor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The model file of a regressor that sees the same two boundaries in every picture."""
+    helper, size = onnx.helper, 32
+    nodes = [
+        helper.make_node("Shape", ["pictures"], ["count"], start=0, end=1),
+        helper.make_node("Constant", [], ["one"], value_ints=[1]),
+        helper.make_node("Concat", ["count", "one"], ["rows"], axis=0),
+        helper.make_node("Constant", [], ["reading"], value=helper.make_tensor("r", 1, [1, len(READING)], READING)),
+        helper.make_node("Tile", ["reading", "rows"], ["readings"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "steadfast",
+        [helper.make_tensor_value_info("pictures", onnx.TensorProto.UINT8, ["N", size, size, 3])],
+        [helper.make_tensor_value_info("readings", onnx.TensorProto.FLOAT, ["N", len(READING)])],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    info = RegressorInfo(
+        name="steadfast",
+        version="1",
+        kind="regressor",
+        threshold=0.5,
+        precision="fp32",
+        training={},
+        metrics={},
+        exporter="",
+        canvas=CanvasInfo(size=size, above=0.1, narrowest=0.5, detail_width=64),
+    )
+    helper.set_model_props(model, {METADATA_KEY: info.model_dump_json()})
+    path = tmp_path_factory.mktemp("models") / "steadfast.onnx"
+    onnx.save(model, str(path))
+    return path
 
 
 def without_timing(message: LanesMessage | None) -> dict[str, Any]:
@@ -49,14 +97,53 @@ def test_both_ego_boundaries_are_followed(real_url: str, drive: list[bytes]) -> 
 
 
 def test_a_stream_in_process_gives_the_same(real_url: str, real_engine: Engine, drive: list[bytes]) -> None:
-    from lanestream.local import LocalEngine
-
     local = InProcess(LocalEngine(real_engine))
     with LaneClient(real_url) as client:
         remote = [without_timing(result.lanes) for result in client.stream(frames(drive), mode="all")]
         assert without_timing(client.detect(drive[0])) == remote[0]
     assert [without_timing(result.lanes) for result in local.stream(frames(drive))] == remote
     assert without_timing(local.detect(drive[0])) == remote[0]
+
+
+def test_a_regressor_beside_the_model_is_a_detector_of_its_own(
+    serve: Serve, drive: list[bytes], regressor: Path
+) -> None:
+    engine = load_engine(None, "cpu", regressor)
+    local = InProcess(LocalEngine(engine))
+    with LaneClient(serve(engine)) as client:
+        assert client.describe("regression").model == "steadfast 1"
+        assert client.describe().model == local.describe("candidates").model != "steadfast 1"
+        results = list(client.stream(frames(drive), mode="all", detector="regression"))
+        remote = [without_timing(result.lanes) for result in results]
+        assert [without_timing(result.lanes) for result in local.stream(frames(drive), detector="regression")] == remote
+        guided = client.detect(drive[0], detector="candidates")
+    assert without_timing(local.detect(drive[0])) == without_timing(guided) != remote[0]
+    for result in results:
+        assert result.lanes is not None
+        assert [lane.position for lane in result.lanes.lanes] == [-1, 1]
+        columns = [(lane.points[0][0] - 319.5) / 640 for lane in result.lanes.lanes]
+        assert columns == pytest.approx([-0.4, 0.4], abs=0.01)
+
+
+def test_a_regressor_as_the_model_is_the_only_detector(regressor: Path, drive: list[bytes]) -> None:
+    local = InProcess(LocalEngine.load(regressor, "cpu"))
+    assert local.describe() == local.describe("regression") == ServiceInfo("steadfast 1", "cpu")
+    assert len(local.detect(drive[0]).lanes) == 2
+    with pytest.raises(NoDetectorError, match="ask for regression"):
+        local.detect(drive[0], detector="candidates")
+    with pytest.raises(ModelError, match="is a regressor itself"):
+        LocalEngine.load(regressor, "cpu", regressor)
+
+
+def test_a_model_may_go_without_a_regressor(drive: list[bytes], regressor: Path) -> None:
+    local = InProcess(LocalEngine.load(None, "cpu", Path("none")))
+    assert len(local.detect(drive[0]).lanes) >= 2
+    with pytest.raises(NoDetectorError, match="ask for candidates"):
+        local.detect(drive[0], detector="regression")
+    with pytest.raises(ModelError, match=r"is a classifier, not a regressor \(give a regressor, or `none`\)"):
+        LocalEngine.load(None, "cpu", SHIPPED_MODEL)
+    assert (chosen_regressor(None), chosen_regressor(Path("none"))) == (DEFAULT_REGRESSOR, None)
+    assert chosen_regressor(regressor) == regressor
 
 
 def test_times_that_jump_break_nothing(real_url: str, drive: list[bytes]) -> None:

@@ -110,6 +110,21 @@ def test_a_horizon_is_used(url: str) -> None:
     assert detect(url, fakes.image_file(), params={"horizon": "0.25"}).json()["horizon"] == pytest.approx(45.0)
 
 
+@pytest.mark.parametrize(("query", "positions"), [("", [-1, 1]), ("candidates", [-1, 1]), ("regression", [-1])])
+def test_the_detector_is_the_one_that_was_asked_for(both_url: str, query: str, positions: list[int]) -> None:
+    response = detect(both_url, fakes.image_file(), params={"detector": query} if query else None)
+    assert [lane["position"] for lane in response.json()["lanes"]] == positions
+
+
+def test_a_detector_that_can_not_be_had_is_refused(url: str) -> None:
+    absent = detect(url, fakes.image_file(), params={"detector": "regression"})
+    assert problem(absent) == (422, "no_detector")
+    assert absent.json()["hint"] == "ask for candidates"
+    unknown = detect(url, fakes.image_file(), params={"detector": "guesses"})
+    assert problem(unknown) == (422, "bad_message")
+    assert "'candidates' or 'regression'" in unknown.json()["message"]
+
+
 def test_an_error_of_our_own_is_no_traceback(url: str) -> None:
     response = detect(url, fakes.image_file(shade=255))
     assert problem(response) == (500, "internal")
@@ -124,16 +139,25 @@ def test_unknown_paths_and_methods_are_told_alike(url: str) -> None:
 
 
 def test_what_runs_is_told(url: str) -> None:
-    model = {"name": "fake 1", "detector": "candidates", "provider": "cpu", "metadata": {"kind": "fake"}}
-    assert httpx.get(f"{url}/v1/models").json() == {"models": [model]}
+    network = {"name": "fake 1", "detector": "candidates", "provider": "cpu"}
+    assert httpx.get(f"{url}/v1/models").json() == {"models": [{**network, "metadata": {"kind": "fake"}}]}
     assert httpx.get(f"{url}/healthz").json() == {"status": "alive"}
-    assert httpx.get(f"{url}/readyz").json() == {"status": "ready", "provider": "cpu"}
+    assert httpx.get(f"{url}/readyz").json() == {"status": "ready", "provider": "cpu", "networks": [network]}
+
+
+def test_every_network_is_told_the_default_first(both_url: str) -> None:
+    models = httpx.get(f"{both_url}/v1/models").json()["models"]
+    ready = httpx.get(f"{both_url}/readyz").json()["networks"]
+    for told in (models, ready):
+        assert [(one["detector"], one["name"]) for one in told] == [("candidates", "fake 1"), ("regression", "other 2")]
+    assert models[1]["metadata"] == {"kind": "other fake"}
 
 
 def test_the_schemas_and_the_documentation_are_there(url: str) -> None:
     schemas = httpx.get(f"{url}/v1/schema").json()
     assert "LanesMessage" in schemas["server"]["$defs"]
-    assert "StartMessage" in schemas["client"]["$defs"]
+    detectors = schemas["client"]["$defs"]["StartMessage"]["properties"]["detector"]["anyOf"]
+    assert {"enum": ["candidates", "regression"], "type": "string"} in detectors
     content = httpx.get(f"{url}/openapi.json").json()["paths"]["/v1/detect"]["post"]["requestBody"]["content"]
     assert {"image/jpeg", "multipart/form-data"} <= set(content)
 

@@ -15,6 +15,8 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from lanestream.detection import Pipeline
+from lanestream.engine import Engine
 from lanestream.protocol import parse_server_message
 
 Serve = Callable[..., str]
@@ -153,6 +155,7 @@ BAD_TEXTS = [
     '{"type": "stop"}',
     '{"type": "start", "mode": "some"}',
     '{"type": "start", "horizon": 1.5}',
+    '{"type": "start", "detector": "guesses"}',
     '{"type": "start", "speed": 1}',
     '{"type": "frame", "seq": -1}',
     '{"type": "frame", "timestamp": 1e400}',
@@ -172,6 +175,53 @@ def test_a_bad_text_is_told_and_costs_nothing(url: str) -> None:
             assert "\n" not in told["message"]
         socket.send(fakes.image_file())
         assert heard(socket)["seq"] == 0
+
+
+@pytest.mark.parametrize(
+    ("asked", "told", "positions"),
+    [
+        ({}, ("candidates", "fake 1"), [-1, 1]),
+        ({"detector": "candidates"}, ("candidates", "fake 1"), [-1, 1]),
+        ({"detector": None}, ("candidates", "fake 1"), [-1, 1]),
+        ({"detector": "regression"}, ("regression", "other 2"), [-1]),
+    ],
+)
+def test_the_detector_is_the_one_that_was_asked_for(
+    both_url: str, asked: dict[str, Any], told: tuple[str, str], positions: list[int]
+) -> None:
+    with stream(both_url) as socket:
+        tell(socket, "start", mode="all", **asked)
+        ready = heard(socket)
+        assert (ready["detector"], ready["model"]) == told
+        socket.send(fakes.image_file())
+        assert [lane["position"] for lane in heard(socket)["lanes"]] == positions
+
+
+def test_a_detector_that_is_not_there_is_told_and_costs_nothing(url: str) -> None:
+    with stream(url) as socket:
+        tell(socket, "start", mode="all", detector="regression")
+        refused = heard(socket)
+        assert (refused["type"], refused["code"], refused["fatal"]) == ("error", "no_detector", False)
+        assert (refused["message"], refused["hint"]) == ("there is no detector regression here", "ask for candidates")
+        tell(socket, "start", mode="all", detector="candidates")
+        assert heard(socket)["type"] == "ready"
+        tell(socket, "start", detector="regression")
+        socket.send(fakes.image_file())
+        assert [heard(socket)[key] for key in ("code", "seq")] == ["no_detector", 0]
+    with stream(url) as socket:
+        tell(socket, "start", detector="regression")
+        socket.send(fakes.image_file())
+        assert heard(socket)["code"] == "no_detector"
+        assert len(heard(socket)["lanes"]) == 2, "a first frame opens the stream with the defaults"
+
+
+def test_the_only_detector_is_the_default(serve: Serve) -> None:
+    only = Engine([Pipeline("regression", fakes.LeftDetector(), fakes.OtherNetwork())])
+    with stream(serve(only)) as socket:
+        tell(socket, "start", detector="candidates")
+        assert heard(socket)["hint"] == "ask for regression"
+        tell(socket, "start")
+        assert heard(socket)["detector"] == "regression"
 
 
 def test_a_message_out_of_place_is_told(serve: Serve) -> None:
@@ -272,6 +322,17 @@ def test_a_stream_before_the_network_is_loaded_is_told_to_come_again(serve: Serv
         tell(socket, "start")
         assert heard(socket)["code"] == "not_ready"
         assert closed(socket)[0] == 1013
+
+
+def test_streams_with_different_detectors_run_at_the_same_time(both_url: str) -> None:
+    with stream(both_url, mode="all") as one, stream(both_url, mode="all", detector="regression") as other:
+        for seq in range(6):
+            one.send(fakes.image_file())
+            other.send(fakes.image_file())
+            for socket, tracks in ((one, [1, 2]), (other, [1])):
+                answer = heard(socket)
+                assert answer["seq"] == seq
+                assert [lane["track_id"] for lane in answer["lanes"]] == tracks
 
 
 def test_streams_know_nothing_of_each_other(url: str) -> None:

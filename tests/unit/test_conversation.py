@@ -65,12 +65,15 @@ def send(conversation: Conversation, seq: int, data: bytes = b"x") -> list[str |
 
 
 def test_the_opening_says_what_was_asked_for() -> None:
-    assert json.loads(Conversation("all", 0.4).opening()) == {
-        "type": "start",
-        "mode": "all",
-        "detector": "candidates",
-        "horizon": 0.4,
-    }
+    assert json.loads(Conversation("all").opening()) == {"type": "start", "mode": "all"}
+    asked = {"type": "start", "mode": "latest", "horizon": 0.4, "detector": "regression"}
+    assert json.loads(Conversation("latest", 0.4, "regression").opening()) == asked
+
+
+def test_an_opening_that_no_service_would_take_is_told() -> None:
+    for conversation in (Conversation("all", 7.0), Conversation("all", detector="guesses")):  # type: ignore[arg-type]
+        with pytest.raises(ProtocolError, match=r"horizon: .* less than 1|detector: .* 'candidates' or 'regression'"):
+            conversation.opening()
 
 
 def test_a_frame_is_its_number_and_time_and_its_bytes() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import AsyncGenerator
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
 from fastapi import APIRouter, Query, Request, Response
@@ -17,10 +17,11 @@ from lanestream.api.accept import preferred
 from lanestream.api.service import Service
 from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
 from lanestream.messages import lanes_message
-from lanestream.protocol import LanesMessage, schemas
+from lanestream.protocol import DetectorName, LanesMessage, schemas
 
 if TYPE_CHECKING:
     from lanestream.api.service import Draw
+    from lanestream.detection import Pipeline
     from lanestream.imaging import ImageLimits
     from lanestream.messages import ProcessedFrame
 
@@ -34,12 +35,22 @@ _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["schema"]}, "required": ["file"]}}
 
 
-class ModelEntry(BaseModel):
-    """A loaded network: its name and version, what runs it, and what its file says of itself."""
+class NetworkEntry(BaseModel):
+    """A loaded network: its name and version, the detector that it answers, and what runs it."""
 
     name: str
     detector: str
     provider: str
+
+    @classmethod
+    def of(cls, pipeline: Pipeline, **more: Any) -> Self:
+        """The entry of a pipeline's network, with the fields `more`."""
+        return cls(name=pipeline.network.name, detector=pipeline.name, provider=pipeline.network.provider, **more)
+
+
+class ModelEntry(NetworkEntry):
+    """A loaded network, and what its file says of itself."""
+
     metadata: dict[str, Any]
 
 
@@ -47,6 +58,14 @@ class ModelList(BaseModel):
     """The networks of the service; the first is the default."""
 
     models: list[ModelEntry]
+
+
+class Readiness(BaseModel):
+    """That the service can be used, and with what; `provider` runs the default detector's network, the first one."""
+
+    status: Literal["ready"]
+    provider: str
+    networks: list[NetworkEntry]
 
 
 class Problem(BaseModel):
@@ -61,7 +80,7 @@ _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     406: {"model": Problem, "description": "No answer in the form that was asked for"},
     413: {"model": Problem, "description": "More bytes or pixels than are accepted"},
     415: {"model": Problem, "description": "Not an image, or a corrupt one"},
-    422: {"model": Problem, "description": "A malformed request"},
+    422: {"model": Problem, "description": "A malformed request, or a detector that is not loaded"},
     503: {"model": Problem, "description": "Not ready yet, or at the session limit"},
 }
 
@@ -87,12 +106,15 @@ async def detect(
     horizon: Annotated[
         float | None, Query(gt=0.0, lt=1.0, description="Row of the horizon as a share of the image height.")
     ] = None,
+    detector: Annotated[
+        DetectorName | None, Query(description="What finds the lanes; the service's default where absent.")
+    ] = None,
 ) -> Response:
     """The lanes of one image, sent as the body or as the file of a form; as JSON, or drawn on it by `Accept`."""
     service = _service(request)
     loaded = service.loaded
     form = _answer_form(request, service.draw)
-    with service.sessions.opened(loaded.engine, horizon) as opened:
+    with service.sessions.opened(loaded.engine, horizon, detector) as opened:
         data = await _image_bytes(request, service.settings.image_limits)
         frame = await loaded.runner.run(opened.session, data, timestamp=0.0, arrived=time.monotonic())
     message = lanes_message(frame, seq=0, timestamp=0.0)
@@ -104,12 +126,9 @@ async def detect(
 
 @router.get("/v1/models", responses={503: _PROBLEMS[503]})
 async def models(request: Request) -> ModelList:
-    """The network that runs, and what really runs it."""
-    network = _service(request).loaded.engine.network
-    info = ModelEntry(
-        name=network.name, detector="candidates", provider=network.provider, metadata=dict(network.metadata)
-    )
-    return ModelList(models=[info])
+    """The networks that are loaded, the default detector's first, and what really runs them."""
+    pipelines = _service(request).loaded.engine.pipelines
+    return ModelList(models=[ModelEntry.of(each, metadata=dict(each.network.metadata)) for each in pipelines])
 
 
 @router.get("/v1/schema")
@@ -125,9 +144,10 @@ async def healthz() -> dict[str, str]:
 
 
 @router.get("/readyz", responses={503: _PROBLEMS[503]})
-async def readyz(request: Request) -> dict[str, str]:
-    """Answers once the network is loaded and warm."""
-    return {"status": "ready", "provider": _service(request).loaded.engine.network.provider}
+async def readyz(request: Request) -> Readiness:
+    """Answers once the networks are loaded and warm."""
+    networks = [NetworkEntry.of(pipeline) for pipeline in _service(request).loaded.engine.pipelines]
+    return Readiness(status="ready", provider=networks[0].provider, networks=networks)
 
 
 def _service(request: Request) -> Service:

@@ -1,4 +1,4 @@
-"""Runs the application in this process: the listening socket, the loading of the network, the life of the server."""
+"""Runs the application in this process: the listening socket, the loading of the networks, the life of the server."""
 
 from __future__ import annotations
 
@@ -69,12 +69,13 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
 async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     host, port = listener.getsockname()[:2]
-    _log.info("listening on http://%s:%d, loading the network", f"[{host}]" if ":" in host else host, port)
+    _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
     try:
         engine = await asyncio.to_thread(load)
         app.state.service.install(engine)
-        network = engine.network
-        _log.info("ready: %s on %s (%s)", network.name, network.provider, network.reason)
+        for name, network in ((pipeline.name, pipeline.network) for pipeline in engine.pipelines):
+            _log.info("detector %s: %s on %s (%s)", name, network.name, network.provider, network.reason)
+        _log.info("ready")
     except BaseException:
         server.should_exit = True
         await serving

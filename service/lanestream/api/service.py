@@ -45,7 +45,7 @@ class Service:
     def loaded(self) -> Loaded:
         """The engine and its threads. Raises NotReadyError before `install`."""
         if self._loaded is None:
-            raise NotReadyError("the network is still being loaded", "ask /readyz, try again in a moment")
+            raise NotReadyError("the networks are still being loaded", "ask /readyz, try again in a moment")
         return self._loaded
 
     @property

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
-from lanestream.errors import LanestreamError, ProtocolError, answer_to
+from lanestream.errors import LanestreamError, NoDetectorError, ProtocolError, answer_to
 from lanestream.messages import lanes_message
 from lanestream.protocol import (
     SUBPROTOCOL,
@@ -29,6 +29,7 @@ from lanestream.sessions.stream_rules import StreamRules
 
 if TYPE_CHECKING:
     from lanestream.api.service import Service
+    from lanestream.detection import Pipeline
     from lanestream.sessions.manager import OpenSession
     from lanestream.sessions.stream_rules import IncomingFrame
 
@@ -85,7 +86,7 @@ class StreamHandler:
         while (message := await self._socket.receive())["type"] != "websocket.disconnect":
             try:
                 await self._take_in(message.get("text"), message.get("bytes"))
-            except ProtocolError as error:
+            except (ProtocolError, NoDetectorError) as error:
                 await self._send(error_message(error))
             self._news.set()
 
@@ -96,8 +97,10 @@ class StreamHandler:
             return
         message = parse_client_message(text)
         if isinstance(message, StartMessage):
+            # First of all, because a detector that is not there leaves the stream as it was.
+            pipeline = self._service.loaded.engine.pipeline(message.detector)
             self._rules.start(message)
-            await self._send(self._ready(self._ensure_session()))
+            await self._send(self._ready(self._ensure_session(), pipeline))
         elif isinstance(message, FrameMessage):
             self._rules.announce(message)
         elif isinstance(message, EndMessage):
@@ -105,19 +108,19 @@ class StreamHandler:
 
     def _ensure_session(self) -> OpenSession:
         if self._opened is None:
-            engine = self._service.loaded.engine
-            self._opened = self._service.sessions.open(engine, self._rules.options.horizon)
-            _log.info("stream %s opened, mode %s", self._opened.id, self._rules.mode)
+            engine, options = self._service.loaded.engine, self._rules.options
+            self._opened = self._service.sessions.open(engine, options.horizon, options.detector)
+            detector = engine.pipeline(options.detector).name
+            _log.info("stream %s opened, mode %s, detector %s", self._opened.id, options.mode, detector)
         return self._opened
 
-    def _ready(self, opened: OpenSession) -> ReadyMessage:
-        network = self._service.loaded.engine.network
+    def _ready(self, opened: OpenSession, pipeline: Pipeline) -> ReadyMessage:
         return ReadyMessage(
             session=opened.id,
             mode=self._rules.mode,
-            detector=self._rules.options.detector,
-            model=network.name,
-            provider=network.provider,
+            detector=pipeline.name,
+            model=pipeline.network.name,
+            provider=pipeline.network.provider,
             limits=self._service.limits,
         )
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from lanestream.errors import BusyError
 
 if TYPE_CHECKING:
+    from lanestream.detection import DetectorName
     from lanestream.engine import Engine
     from lanestream.sessions.session import Session
 
@@ -30,11 +31,14 @@ class SessionManager:
         self._limit = limit
         self._open: dict[str, OpenSession] = {}
 
-    def open(self, engine: Engine, horizon: float | None = None) -> OpenSession:
-        """A new session; `horizon` as a share of the image height. Raises BusyError at the limit."""
+    def open(self, engine: Engine, horizon: float | None = None, detector: DetectorName | None = None) -> OpenSession:
+        """A new session; `horizon` as a share of the image height.
+
+        Raises BusyError at the limit, NoDetectorError where `detector` is not loaded.
+        """
         if len(self._open) >= self._limit:
             raise BusyError(f"all {self._limit} sessions are taken", "try again later")
-        opened = OpenSession(secrets.token_hex(8), engine.open_session(horizon))
+        opened = OpenSession(secrets.token_hex(8), engine.open_session(horizon, detector))
         self._open[opened.id] = opened
         return opened
 
@@ -43,9 +47,11 @@ class SessionManager:
         del self._open[opened.id]
 
     @contextmanager
-    def opened(self, engine: Engine, horizon: float | None = None) -> Iterator[OpenSession]:
+    def opened(
+        self, engine: Engine, horizon: float | None = None, detector: DetectorName | None = None
+    ) -> Iterator[OpenSession]:
         """A session for the length of a `with` block."""
-        opened = self.open(engine, horizon)
+        opened = self.open(engine, horizon, detector)
         try:
             yield opened
         finally:
