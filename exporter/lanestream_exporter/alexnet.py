@@ -1,8 +1,8 @@
 """AlexNet in PyTorch: torchvision's topology and key names, with batch normalisation beside it while it trains.
 
 Source: A. Krizhevsky, "One weird trick for parallelizing convolutional neural networks", 2014, the variant that
-torchvision ships. The normalisation layers live under their own keys (`norms.*`), so a torchvision checkpoint loads as
-it is, and folding them leaves exactly the plain network.
+torchvision ships. The normalisation layers live under their own keys (`norms.*`, `hidden_norms.*`), so a torchvision
+checkpoint loads as it is, and folding them leaves exactly the plain network.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lanestream.errors import CheckpointError
 
@@ -21,10 +22,15 @@ INPUT_SIZE = 224
 LEAST_CONTRAST = 0.03
 
 _CONVOLUTIONS = (0, 3, 6, 8, 10)
+_HIDDEN = (1, 4)
+_NORMS = ("norms.", "hidden_norms.")
 
 
 class AlexNet(nn.Module):
-    """The network for `classes` classes; `normalised` adds a batch normalisation after each convolution."""
+    """The network for `classes` classes; `normalised` adds a batch normalisation after each layer but the last.
+
+    Without it most hidden units die in the first hundred steps.
+    """
 
     def __init__(self, classes: int = 2, normalised: bool = True, dropout: float = 0.5) -> None:
         super().__init__()
@@ -46,6 +52,7 @@ class AlexNet(nn.Module):
         self.norms = nn.ModuleDict(
             {str(i): nn.BatchNorm2d(self._convolution(i).out_channels) for i in _CONVOLUTIONS} if normalised else {}
         )
+        self.hidden_norms = nn.ModuleDict({str(i): nn.BatchNorm1d(4096) for i in _HIDDEN} if normalised else {})
         self.classifier = nn.Sequential(
             nn.Dropout(dropout),
             nn.Linear(256 * 6 * 6, 4096),
@@ -62,8 +69,12 @@ class AlexNet(nn.Module):
             x = layer(x)
             if str(index) in self.norms:
                 x = self.norms[str(index)](x)
-        logits: Tensor = self.classifier(torch.flatten(x, 1))
-        return logits
+        x = torch.flatten(x, 1)
+        for index, layer in enumerate(self.classifier):
+            x = layer(x)
+            if str(index) in self.hidden_norms:
+                x = self.hidden_norms[str(index)](x)
+        return x
 
     def _convolution(self, index: int) -> nn.Conv2d:
         layer = self.features[index]
@@ -71,9 +82,9 @@ class AlexNet(nn.Module):
         return layer
 
     def folded(self) -> AlexNet:
-        """The same function as a plain AlexNet: each normalisation goes into the convolution before it."""
+        """The same function as a plain AlexNet: each normalisation goes into the layer before it."""
         plain = AlexNet(self.classes, normalised=False)
-        plain.load_state_dict({k: v.clone() for k, v in self.state_dict().items() if not k.startswith("norms.")})
+        plain.load_state_dict({k: v.clone() for k, v in self.state_dict().items() if not k.startswith(_NORMS)})
         for key, norm in self.norms.items():
             assert isinstance(norm, nn.BatchNorm2d)  # noqa: S101 - as above
             mine = plain._convolution(int(key))
@@ -82,6 +93,10 @@ class AlexNet(nn.Module):
             gain = norm.weight / torch.sqrt(variance + norm.eps)
             mine.weight.data = mine.weight.data * gain[:, None, None, None]
             mine.bias.data = (mine.bias.data - mean) * gain + norm.bias
+        for key, norm in self.hidden_norms.items():
+            hidden = plain.classifier[int(key)]
+            assert isinstance(hidden, nn.Linear) and isinstance(norm, nn.BatchNorm1d)  # noqa: S101, PT018 - as above
+            plain.classifier[int(key)] = fuse_linear_bn_eval(hidden.eval(), norm.eval())
         return plain.eval()
 
     @property
@@ -110,7 +125,7 @@ def initialise(network: AlexNet, weights: Path) -> None:
     Raises CheckpointError where the file is not one.
     """
     state = load_state(weights)
-    wanted = {k: v for k, v in network.state_dict().items() if not k.startswith(("norms.", "classifier.6."))}
+    wanted = {k: v for k, v in network.state_dict().items() if not k.startswith((*_NORMS, "classifier.6."))}
     wrong = [key for key, value in wanted.items() if key not in state or state[key].shape != value.shape]
     if wrong:
         raise CheckpointError(f"{weights} lacks {wrong[0]} of a torchvision AlexNet", "give alexnet weights")

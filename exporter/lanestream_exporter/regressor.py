@@ -7,12 +7,14 @@ it is known, and where the horizon is; and it learns from lateral errors at rows
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lanestream.detection.regression import ANCHORS
 from lanestream_exporter.alexnet import AlexNet
@@ -32,12 +34,12 @@ class LaneRegressor(nn.Module):
     columns are all of one size, which a network learns more easily.
     """
 
-    def __init__(self, normalised: bool = True, dropout: float = 0.3) -> None:
+    def __init__(self, normalised: bool = True, dropout: float = 0.1) -> None:
         super().__init__()
         trunk = AlexNet(normalised=normalised)
         self.features, self.norms = trunk.features, trunk.norms
-        self.hidden = nn.Sequential(nn.Dropout(dropout), nn.Linear(256 * 6 * 6, 4096), nn.ReLU())
-        self.shape = nn.Sequential(nn.Linear(4096, 16), nn.ReLU(), nn.Linear(16, 6))
+        self.hidden = nn.Sequential(nn.Dropout(dropout), *_linear(256 * 6 * 6, 4096, normalised), nn.ReLU())
+        self.shape = nn.Sequential(*_linear(4096, 16, normalised), nn.ReLU(), nn.Linear(16, 6))
         self.doubts = nn.Linear(4096, 9)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -56,11 +58,23 @@ class LaneRegressor(nn.Module):
     def folded(self) -> LaneRegressor:
         """The same function without normalisation layers: each goes into the convolution before it."""
         plain = LaneRegressor(normalised=False)
-        plain.load_state_dict({k: v.clone() for k, v in self.state_dict().items() if not k.startswith("norms.")})
         trunk = AlexNet(normalised=True)
         trunk.features, trunk.norms = self.features, self.norms
         plain.features = trunk.folded().features
+        plain.hidden[1] = _fused(self.hidden[1], self.hidden[2])
+        plain.shape[0] = _fused(self.shape[0], self.shape[1])
+        plain.shape[2], plain.doubts = copy.deepcopy(self.shape[3]), copy.deepcopy(self.doubts)
         return plain.eval()
+
+
+def _fused(linear: nn.Module, norm: nn.Module) -> nn.Linear:
+    assert isinstance(linear, nn.Linear) and isinstance(norm, nn.BatchNorm1d)  # noqa: S101, PT018 - tells mypy
+    return fuse_linear_bn_eval(linear.eval(), norm.eval())
+
+
+def _linear(inputs: int, outputs: int, normalised: bool) -> list[nn.Module]:
+    """A linear layer, normalised while it trains: without that most of its units die in the first hundred steps."""
+    return [nn.Linear(inputs, outputs), *([nn.BatchNorm1d(outputs)] if normalised else [])]
 
 
 @dataclass(frozen=True)

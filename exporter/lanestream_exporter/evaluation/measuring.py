@@ -18,6 +18,7 @@ from lanestream_exporter.datasets.splits import LabelledClip, Split, labelled_cl
 from lanestream_exporter.evaluation.boundaries import Found
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
+from lanestream_exporter.evaluation.lateral import lateral_figures
 from lanestream_exporter.evaluation.methods import Method
 from lanestream_exporter.evaluation.outcomes import Outcome
 from lanestream_exporter.evaluation.steadiness import steadiness
@@ -95,7 +96,11 @@ class Evaluation:
 
 def image_figures(method: Method, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """All figure groups of a method on single images. A further group is one more entry here."""
-    figures: dict[str, Any] = {"boundaries": boundary_figures(outcomes), "field": field_figures(outcomes)}
+    figures: dict[str, Any] = {
+        "boundaries": boundary_figures(outcomes),
+        "lateral": lateral_figures(outcomes),
+        "field": field_figures(outcomes),
+    }
     if method.threshold is not None:
         figures["candidates"] = candidate_figures(outcomes, method.threshold)
     return figures

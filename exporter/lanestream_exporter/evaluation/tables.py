@@ -12,6 +12,7 @@ from rich.text import Text
 # The cells of a row, from a method's figure groups of a drive; none where it has no such figures.
 Values = Callable[[Mapping[str, Any]], list[float | None]]
 
+_LATERAL = ("10 m", "ratio", "30 m", "ratio")
 _BOUNDARIES = ("ego P", "ego R", "ego F1", "px", "all P", "all R", "all F1")
 
 
@@ -24,6 +25,9 @@ def tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     if any(clips.values()):
         yield _table("B. Clips with the tracker", _BOUNDARIES, clips, lambda groups: _boundaries(groups["tracked"]))
         yield _table("B. Clips frame by frame", _BOUNDARIES, clips, lambda groups: _boundaries(groups["alone"]))
+    yield _table(
+        "Lateral error of the ego pair, px at 640 wide, and over a constant answer's", _LATERAL, images, _lateral
+    )
     yield _table("C. The field's metrics", ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5"), images, _field)
 
 
@@ -42,6 +46,10 @@ def _on_images(groups: Mapping[str, Any]) -> list[float | None]:
 def _boundaries(part: Mapping[str, Any]) -> list[float | None]:
     pair = [part["ego"][key] for key in ("precision", "recall", "f1", "mean_error_px_640")]
     return [*pair, *(part["all"][key] for key in ("precision", "recall", "f1"))]
+
+
+def _lateral(groups: Mapping[str, Any]) -> list[float | None]:
+    return [groups["lateral"][place][key] for place in ("10m", "30m") for key in ("mean_px_640", "ratio")]
 
 
 def _field(groups: Mapping[str, Any]) -> list[float | None]:
