@@ -116,9 +116,14 @@ def rendered_frames(folder: Path, scenes: Sequence[int], workers: int, done: Cal
 
 
 def real_road_frames(root: Path, split: Split) -> list[RoadFrame]:
-    """The labelled real frames of a split; those with a single boundary have the horizon of their drive."""
+    """The project's labelled real frames of a split, made small."""
+    return road_frames(real_frames(root, split))
+
+
+def road_frames(labelled: Iterable[tuple[LabelledFrame, Image]]) -> list[RoadFrame]:
+    """Labelled frames with their BGR images, made small; those with a single boundary have their drive's horizon."""
     drives: dict[str, list[tuple[LabelledFrame, Image]]] = {}
-    for frame, image in real_frames(root, split):
+    for frame, image in labelled:
         drives.setdefault(frame.group, []).append((frame, image))
     frames = []
     for drive in drives.values():

@@ -68,10 +68,10 @@ def regressor(config: Path, folder: Path, data: Path | None, frames: Path | None
     settings = read_config(config, RegressorConfig)
     network = starting_regressor(settings)
     with _bar("rendering") as advance:
-        sources, origin = frame_sources(settings.data, frames or folder / "frames", data, advance)
+        sources = frame_sources(settings.data, frames or folder / "frames", data, advance)
     for source in sources:
         click.echo(f"{source.name}: {len(source.train)} frames to train on, {len(source.check)} to validate with")
-    _learn(RegressorTask(settings, network, sources, origin), settings, folder)
+    _learn(RegressorTask(settings, network, sources, origin_of(settings.data)), settings, folder)
 
 
 @train.command()
