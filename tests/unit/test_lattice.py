@@ -1,0 +1,73 @@
+"""Where boundaries are expected once the ego lane is known, and how a prior changes the candidates."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from lanestream.detection.candidates import CandidateSearch
+from lanestream.detection.lattice import Lattice
+from lanestream.detection.prior import RoadPrior
+from lanestream.geometry import RoadView
+from lanestream.lanes import Curve, Image
+
+
+def test_lines_at_places_of_the_lattice_are_trusted_most() -> None:
+    lattice = Lattice(-1.0, 1.4)
+    assert lattice.neighbours == pytest.approx((-3.4, 3.8))
+    places = [lattice.trust(slope) for slope in (-1.0, 1.4, -3.4, 3.8)]
+    assert places == pytest.approx([1.0] * 4)
+    assert lattice.trust(0.2) < 0.4
+    assert lattice.trust(6.2) == pytest.approx(0.6)
+
+
+def test_one_boundary_stands_for_a_usual_lane() -> None:
+    assert Lattice.of(-1.2, None).right > 0.0
+    assert Lattice.of(None, 1.2).left < 0.0
+    with pytest.raises(ValueError, match="boundary"):
+        Lattice.of(None, None)
+
+
+def test_a_lane_that_can_be_none_does_not_set_the_width() -> None:
+    assert 1.0 < Lattice(-0.1, 0.1).width < 2.0
+    assert Lattice(-5.0, 5.0).width < 5.0
+
+
+def faint_road(bend: float) -> tuple[Image, RoadPrior]:
+    """A bent road of two lanes whose boundaries can hardly be seen, and a prior that knows the ego lane."""
+    rng = np.random.default_rng(3)
+    view = RoadView(640, 360, 150.0)
+    image = rng.normal(100.0, 4.0, (360, 640, 3))
+    curves = [Curve(150.0, (320.0, b, bend * view.depth**2)) for b in (-1.2, 1.2, 3.6)]
+    rows = np.linspace(359.0, 165.0, 100)
+    for curve in curves:
+        line = np.stack([curve.x(rows), rows], axis=1).round().astype(np.int32)
+        cv2.polylines(image, [line], isClosed=False, color=(112.0, 112.0, 112.0), thickness=2)
+    return image.clip(0, 255).astype(np.uint8), RoadPrior(view, curves[0], curves[1])
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.02])
+def test_a_prior_puts_its_own_boundaries_and_their_neighbours_first(bend: float) -> None:
+    image, prior = faint_road(bend)
+    proposals = CandidateSearch(limit=4).propose(image, prior=prior)
+    assert proposals.view.horizon == pytest.approx(prior.view.horizon)
+    rows = np.array([200.0, 250.0])
+    outer = Curve(150.0, (320.0, 3.6, bend * prior.view.depth**2))
+    for wanted in (*prior.curves, outer):
+        off = [np.abs(candidate.curve.x(rows) - wanted.x(rows)).max() for candidate in proposals.candidates]
+        assert min(off) < 6.0
+
+
+def test_a_prior_without_boundaries_is_none() -> None:
+    image, prior = faint_road(0.0)
+    nothing = RoadPrior(prior.view, None, None)
+    plain, guided = (CandidateSearch().propose(image, prior=given) for given in (None, nothing))
+    assert [c.curve for c in plain.candidates] == [c.curve for c in guided.candidates]
+
+
+def test_boundaries_of_the_last_frame_come_before_the_prior() -> None:
+    image, prior = faint_road(0.0)
+    expected = Curve(150.0, (320.0, -0.6, 0.0))
+    proposals = CandidateSearch().propose(image, 150.0, [expected], prior)
+    assert proposals.candidates[0].curve == expected

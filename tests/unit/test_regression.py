@@ -1,0 +1,215 @@
+"""The second detector: its canvas, what it reads from the network's answer, its training samples and its loss."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from lanestream.detection.prior import RoadGlance
+from lanestream.detection.regression import ANCHORS, OUTPUTS, RegressionDetector, RoadReading
+from lanestream.geometry import CanvasGeometry, RoadView
+from lanestream.lanes import Curve, Image
+from lanestream_exporter.canvases import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss, logs_at_shares
+from lanestream_exporter.roadframes import RoadFrame, read_frames, shared_horizon, write_frames
+
+WIDTH, HEIGHT, HORIZON = 640, 360, 150.0
+VIEW = RoadView(WIDTH, HEIGHT, HORIZON)
+MIDDLE = (WIDTH - 1) / 2.0
+LEFT, RIGHT = Curve(HORIZON, (MIDDLE + 8.0, -1.1, 300.0)), Curve(HORIZON, (MIDDLE + 8.0, 1.3, 300.0))
+
+
+def road() -> Image:
+    """A grey road with both boundaries in white."""
+    image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    for curve in (LEFT, RIGHT):
+        cv2.polylines(
+            image, [points(curve).round().astype(np.int32)], isClosed=False, color=(255, 255, 255), thickness=3
+        )
+    return image
+
+
+def points(curve: Curve) -> NDArray[np.float64]:
+    rows = np.linspace(HEIGHT - 1.0, HORIZON + 12.0, 120)
+    inside = np.stack([curve.x(rows), rows], axis=1)
+    return inside[(inside[:, 0] >= 0) & (inside[:, 0] <= WIDTH - 1)]
+
+
+@pytest.fixture(scope="module")
+def frame() -> RoadFrame:
+    lanes = tuple(LabelledLane(points(curve)) for curve in (LEFT, RIGHT))
+    made = RoadFrame.of(LabelledFrame(WIDTH, HEIGHT, lanes, "drive", "drawn", exhaustive=True), road())
+    assert made is not None
+    return made
+
+
+class Told:
+    """A network that gives the answers it was told, one a call."""
+
+    name, provider, reason = "told", "cpu", "a test"
+    metadata: dict[str, object] = {}  # noqa: RUF012
+
+    def __init__(self, *answers: NDArray[np.float32]) -> None:
+        self.answers = list(answers)
+        self.seen: list[NDArray[np.uint8]] = []
+
+    def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        self.seen.append(inputs)
+        return self.answers.pop(0)[None]
+
+
+def answer(horizon: float = 0.0, presence: tuple[float, float] = (0.9, 0.9)) -> NDArray[np.float32]:
+    """What a network should say of the road, seen in a view whose horizon is `horizon` depths too high."""
+    rows = HORIZON + np.array(ANCHORS) * VIEW.depth
+    columns = [(curve.x(rows) - MIDDLE) / WIDTH for curve in (LEFT, RIGHT)]
+    return np.concatenate([*columns, np.full(6, 0.01), presence, [horizon]]).astype(np.float32)
+
+
+def test_the_answer_is_read_as_the_curves_it_was_made_of() -> None:
+    reading = RoadReading.of(answer())
+    for side, curve in enumerate((LEFT, RIGHT)):
+        np.testing.assert_allclose(reading.curve(side, VIEW).coefficients, curve.coefficients, rtol=1e-3)
+        covariance = reading.covariance(side, VIEW)
+        assert (np.linalg.eigvalsh(covariance) > 0.0).all()
+
+
+def test_boundaries_are_told_from_the_threshold_on_with_the_horizon_that_was_seen() -> None:
+    detector = RegressionDetector(threshold=0.5)
+    prepared = detector.prepare(road(), HORIZON)
+    assert prepared.inputs.shape == (1, 224, 224, 3)
+    found = detector.finish(prepared, answer(0.1, (0.4, 0.9))[None])
+    assert [d.probability for d in found.detections] == [pytest.approx(0.9)]
+    assert found.view.horizon == pytest.approx(HORIZON + 0.1 * VIEW.depth)
+
+
+def test_the_canvas_keeps_the_horizon_in_its_place_and_the_middle_in_the_middle() -> None:
+    geometry = CanvasGeometry(size=113, above=0.12)
+    columns, rows = geometry.grid(VIEW)
+    np.testing.assert_allclose(rows[12], HORIZON, atol=1e-6)
+    np.testing.assert_allclose(rows[-1], HEIGHT - 1.0)
+    np.testing.assert_allclose(columns[:, 56], MIDDLE)
+    np.testing.assert_allclose(columns[-1, [0, -1]], [MIDDLE - WIDTH / 2, MIDDLE + WIDTH / 2])
+    assert columns[0, -1] - columns[0, 0] == pytest.approx(0.6 * WIDTH)
+
+
+def test_a_horizon_far_off_is_looked_at_again() -> None:
+    network = Told(answer(0.2), answer())
+    prior = RoadGlance(RegressionDetector(), network).look(road(), HORIZON - 0.2 * VIEW.depth)
+    assert len(network.seen) == 2
+    assert not np.array_equal(network.seen[0], network.seen[1])
+    assert prior.left is not None
+    assert prior.right is not None
+
+
+def test_what_is_not_there_is_no_prior() -> None:
+    prior = RoadGlance(RegressionDetector(), Told(answer(presence=(0.9, 0.1)))).look(road(), HORIZON)
+    assert prior.right is None
+    assert len(prior.curves) == 1
+
+
+def test_labels_tell_the_horizon_they_share() -> None:
+    assert shared_horizon([points(LEFT), points(RIGHT)], HEIGHT, None) == pytest.approx(HORIZON, abs=1.0)
+    assert shared_horizon([points(LEFT)], HEIGHT, None) is None
+    assert shared_horizon([], HEIGHT, 140.0) == 140.0
+
+
+@pytest.mark.parametrize(
+    "warp",
+    [
+        Warp(),
+        Warp(pan=0.05),
+        Warp(side=0.2),
+        Warp(zoom=1.15),
+        Warp(bend=0.01),
+        Warp(assumed=0.1),
+        Warp(flipped=True),
+        Warp(pan=-0.04, side=-0.15, zoom=0.9, bend=-0.01, assumed=-0.05, flipped=True),
+    ],
+)
+def test_a_moved_frame_shows_its_paint_where_the_target_says(frame: RoadFrame, warp: Warp) -> None:
+    geometry = CanvasGeometry()
+    canvas, target = sample(frame, geometry, warp)
+    view = RoadView(frame.width, frame.height, frame.horizon)
+    seen = RoadView(frame.width, frame.height, frame.horizon + warp.assumed * view.depth)
+    grid_columns, grid_rows = geometry.grid(seen)
+    checked = 0
+    for side in (0, 1):
+        for share, x, known in zip(SHARES, target.columns[side], target.known[side], strict=True):
+            row = int(np.argmin(np.abs(grid_rows[:, 0] - (view.horizon + share * view.depth))))
+            column = (frame.width - 1) / 2.0 + x * frame.width
+            if known < 1.0 or share < 0.2 or not grid_columns[row, 8] < column < grid_columns[row, -9]:
+                continue
+            at = int(np.argmin(np.abs(grid_columns[row] - column)))
+            bright = canvas[row, at - 8 : at + 9, 0].astype(float) - 90.0
+            assert bright.max() > 60.0
+            assert abs(float((bright.clip(0) * np.arange(-8, 9)).sum() / bright.clip(0).sum())) < 2.5
+            checked += 1
+    assert checked >= 6
+    assert target.presence.tolist() == [1.0, 1.0]
+    assert target.horizon == pytest.approx((view.horizon - seen.horizon) / seen.depth)
+
+
+def test_a_plain_warp_takes_an_unknown_horizon_for_the_usual_one(frame: RoadFrame) -> None:
+    assert plain_warp(frame, known=True) == Warp()
+    depth = frame.height - 1.0 - frame.horizon
+    assert frame.horizon + plain_warp(frame, known=False).assumed * depth == pytest.approx(0.46 * frame.height)
+
+
+def test_frames_survive_their_file(frame: RoadFrame, tmp_path: Path) -> None:
+    path = tmp_path / "frames.npz"
+    assert write_frames(path, [frame, frame]) == 2
+    again = read_frames(path)[1]
+    np.testing.assert_allclose(again.lanes[0], frame.lanes[0], atol=1e-3)
+    assert (again.jpeg, again.horizon, again.group) == (frame.jpeg, frame.horizon, "drive")
+
+
+def test_the_loss_is_least_at_the_truth() -> None:
+    generator = torch.Generator().manual_seed(0)
+    columns = torch.rand((4, 2, 3), generator=generator) - 0.5
+    truth = {
+        "columns": columns @ at_shares().T,
+        "known": torch.ones(4, 2, len(SHARES)),
+        "presence": torch.ones(4, 2),
+        "horizon": torch.zeros(4),
+    }
+    sure, certain = torch.full((4, 2, 3), -5.0), torch.full((4, 2), 8.0)
+    best = lateral_loss(Answer(columns, sure, certain, torch.zeros(4)), truth)
+    for worse in (
+        Answer(columns + 0.02, sure, certain, torch.zeros(4)),
+        Answer(columns, sure + 2.0, certain, torch.zeros(4)),
+        Answer(columns, sure, -certain, torch.zeros(4)),
+        Answer(columns, sure, certain, torch.full((4,), 0.1)),
+    ):
+        assert lateral_loss(worse, truth) > best + 0.05
+
+
+def test_deviations_are_interpolated_between_the_anchors() -> None:
+    weights = logs_at_shares()
+    np.testing.assert_allclose(weights.sum(dim=1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(weights[0], [1.0, 0.0, 0.0], atol=1e-6)
+
+
+def test_folding_leaves_the_same_function() -> None:
+    torch.manual_seed(0)
+    network = LaneRegressor()
+    for norm in (
+        module for module in network.modules() if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d)
+    ):
+        torch.nn.init.uniform_(norm.weight, 0.5, 1.5)
+        torch.nn.init.uniform_(norm.running_var, 0.5, 1.5)  # type: ignore[arg-type]
+        torch.nn.init.normal_(norm.running_mean)  # type: ignore[arg-type]
+    network.eval()
+    canvases = torch.randn(2, 3, 224, 224)
+    with torch.inference_mode():
+        plain = network.folded()
+        assert not [
+            module for module in plain.modules() if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d)
+        ]
+        np.testing.assert_allclose(plain(canvases), network(canvases), rtol=1e-3, atol=1e-3)
+        assert Answer.of(plain(canvases)).told().shape == (2, OUTPUTS)
