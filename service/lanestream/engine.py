@@ -84,10 +84,6 @@ def load_engine(model: Path | None = None, provider: Provider = "auto", regresso
     """
     network = _warm(model or SHIPPED_MODEL, provider)
     if isinstance(network.info, RegressorInfo):
-        if regressor not in (None, DEFAULT_REGRESSOR):
-            raise ModelError(
-                f"{model} is a regressor itself", f"leave {regressor} out, or give a classifier as the model"
-            )
         return Engine([Pipeline("regression", _regression(network.info), network)])
     if regressor is None:
         return Engine([Pipeline("candidates", _candidates(network.info, None), network)])

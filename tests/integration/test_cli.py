@@ -238,6 +238,13 @@ def test_a_model_that_is_none_ends_the_service(run: Run, tmp_path: Path, option:
     assert name in errors.splitlines()[-1]
 
 
+def test_the_regressor_can_be_named_by_a_variable(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LANESTREAM_REGRESSOR", "none.onnx")
+    code, _, errors = run("serve", "--port", "0")
+    assert code == 1
+    assert errors.splitlines()[-1].startswith("error: no model file at none.onnx (")
+
+
 @pytest.fixture
 def service() -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`lanestream serve` in a process of its own, with its URL."""

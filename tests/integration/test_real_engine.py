@@ -131,8 +131,6 @@ def test_a_regressor_as_the_model_is_the_only_detector(regressor: Path, drive: l
     assert len(local.detect(drive[0]).lanes) == 2
     with pytest.raises(NoDetectorError, match="ask for regression"):
         local.detect(drive[0], detector="candidates")
-    with pytest.raises(ModelError, match="is a regressor itself"):
-        LocalEngine.load(regressor, "cpu", regressor)
 
 
 def test_a_model_may_go_without_a_regressor(drive: list[bytes], regressor: Path) -> None:
