@@ -18,7 +18,7 @@ from lanestream_exporter.alexnet import AlexNet, normalise
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import truncated
 from lanestream_exporter.exporting.graph import publish
-from lanestream_exporter.exporting.normalisation import imagenet
+from lanestream_exporter.exporting.normalisation import contrast, imagenet
 from lanestream_exporter.exporting.proof import boundaries
 from lanestream_exporter.exporting.subject import Check
 
@@ -91,6 +91,11 @@ def test_brightness_and_contrast_of_a_patch_do_not_matter(patches: NDArray[np.ui
     dim = (patches[:2].astype(np.float32) * 0.5 + 20.0).astype(np.uint8)
     difference = normalise(torch.from_numpy(dim)) - normalise(torch.from_numpy(patches[:2]))
     assert difference.abs().mean().item() < 0.1
+
+
+def test_the_served_normalisation_is_that_of_training(patches: NDArray[np.uint8]) -> None:
+    images = torch.from_numpy(np.concatenate([patches[:6], patches[:2] // 50, np.full_like(patches[:1], 77)]))
+    torch.testing.assert_close(contrast(images), normalise(images), rtol=1e-4, atol=1e-5)
 
 
 def test_imagenets_normalisation_is_that_of_torchvision() -> None:

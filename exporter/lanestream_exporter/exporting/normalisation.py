@@ -8,7 +8,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from lanestream_exporter.alexnet import normalise
+from lanestream_exporter.alexnet import LEAST_CONTRAST
 
 # Means and standard deviations of ImageNet's red, green and blue, from 0 to 1: the usual recipe of torchvision.
 _MEANS: Final = (0.485, 0.456, 0.406)
@@ -21,5 +21,14 @@ def imagenet(images: Tensor) -> Tensor:
     return (images.permute(0, 3, 1, 2).float() / 255.0 - means) / deviations
 
 
-# "contrast": each picture against its own brightness and contrast, as this project trains.
-NORMALISATIONS: Final[Mapping[str, Callable[[Tensor], Tensor]]] = {"contrast": normalise, "imagenet": imagenet}
+def contrast(images: Tensor) -> Tensor:
+    """The same as `alexnet.normalise`, in fewer passes over the pixels: beside an int8 network each of them counts."""
+    pixels = images.permute(0, 3, 1, 2).float()
+    centred = pixels - pixels.mean(dim=(1, 2, 3), keepdim=True)
+    length = torch.linalg.vector_norm(centred, dim=(1, 2, 3), keepdim=True)
+    deviation = length / (pixels.shape[1] * pixels.shape[2] * pixels.shape[3]) ** 0.5
+    return centred / (deviation + 255.0 * LEAST_CONTRAST)
+
+
+# "contrast", each picture against its own brightness and contrast, is how this project trains.
+NORMALISATIONS: Final[Mapping[str, Callable[[Tensor], Tensor]]] = {"contrast": contrast, "imagenet": imagenet}

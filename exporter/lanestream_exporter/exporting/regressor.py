@@ -15,11 +15,11 @@ from torch import Tensor, nn
 from lanestream.detection.regression import RegressionDetector
 from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import CanvasInfo, RegressorInfo
-from lanestream_exporter.alexnet import normalise
 from lanestream_exporter.canvases import SHARES, Warp, plain_warp, sample
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import in_batches, truncated
 from lanestream_exporter.exporting.frames import FrameSource
+from lanestream_exporter.exporting.normalisation import contrast
 from lanestream_exporter.exporting.subject import Check, Description, Figures
 from lanestream_exporter.exporting.versions import exporter, product
 from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares
@@ -47,7 +47,7 @@ class ServedRegressor(nn.Module):
 
     def forward(self, canvases: Tensor) -> Tensor:
         """Only the network itself is ever in half precision."""
-        answer = Answer.of(self.network(normalise(canvases).to(self.dtype)).float())
+        answer = Answer.of(self.network(contrast(canvases).to(self.dtype)).float())
         return replace(answer, presence=answer.presence / self.temperature).told()
 
 
@@ -94,13 +94,13 @@ class RegressorSubject:
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> RegressorSubject:
         """With a thinner hidden layer."""
         small = copy.deepcopy(self.network)
-        seen = in_batches(lambda part: torch.flatten(small.features(normalise(part)), 1), inputs)
+        seen = in_batches(lambda part: torch.flatten(small.features(contrast(part)), 1), inputs)
         small.hidden = truncated(small.hidden, seen, energy)
         return replace(self, network=small)
 
     def calibrated(self, check: Check) -> RegressorSubject:
         """With a temperature and a threshold of presence, where the labels tell presence and absence."""
-        raw = in_batches(lambda part: self.network(normalise(part)), check.inputs)
+        raw = in_batches(lambda part: self.network(contrast(part)), check.inputs)
         logits, presence = Answer.of(raw).presence.numpy(), check.truth["presence"]
         told = logits[presence >= 0.0]
         pairs = np.stack([np.zeros_like(told), told], axis=1)
