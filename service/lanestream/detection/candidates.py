@@ -59,14 +59,16 @@ class _Line:
 class CandidateSearch:
     """How candidates are found: Hough lines and their pairs, lines of the fan, then suppression.
 
-    `limit` is the most candidates of a frame. Two edges are one marking where their distance is `least_width` to
-    `most_width` times the rows below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for
-    double lines). Candidates nearer than `separation` times the rows below the horizon, at two rows, are the same.
+    `perspective` looks for the road's perspective around a guess, `near_prior` around what a prior says of it. `limit`
+    is the most candidates of a frame. Two edges are one marking where their distance is `least_width` to `most_width`
+    times the rows below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for double lines).
+    Candidates nearer than `separation` times the rows below the horizon, at two rows, are the same.
     """
 
     hough: ExtendedHough = ExtendedHough()
     vanishing: VanishingPointSearch = VanishingPointSearch()
     perspective: PerspectiveSearch = PerspectiveSearch()
+    near_prior: PerspectiveSearch = PerspectiveSearch(spread_x=0.03, nod=0.01, spread_bend=0.015)
     fan: Fan = Fan()
     limit: int = 16
     least_width: float = 0.03
@@ -90,7 +92,9 @@ class CandidateSearch:
         scaling = Scaling(WORKING_WIDTH / width)
         grey = resized(paint_grey(image), scaling)
         if prior is not None and prior.curves:
-            point = _perspective(prior, scaling, grey.shape[0])
+            guess = _perspective(prior, scaling, grey.shape[0])
+            ridges = find_ridges(grey, guess.y)
+            point = self.near_prior.refine(guess, ridges, grey.shape[1], grey.shape[0] - 1.0, known=True)
             lines = self._edges_and_lines(grey, point.y)
         else:
             point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon))

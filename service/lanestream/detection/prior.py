@@ -12,6 +12,10 @@ from lanestream.detection.regression import RegressionDetector, RoadReading
 from lanestream.geometry import RoadView
 from lanestream.lanes import Curve, Image
 
+# A boundary whose place is known no better than this, in image widths, leads nowhere: a network that says so has seen
+# a road unlike those it knows.
+_MOST_DOUBT: Final = 0.1
+
 # A horizon farther than this from where it was taken to be, in depths, is worth a second look at the right place.
 _SECOND_LOOK: Final = 0.06
 
@@ -46,10 +50,12 @@ class RoadGlance:
         if abs(reading.horizon) > _SECOND_LOOK:
             view, reading = self._reading(image, reading.view(view).horizon)
         seen = reading.view(view)
-        left, right = (
-            reading.curve(side, seen) if reading.presence[side] >= self.detector.threshold else None for side in (0, 1)
-        )
+        left, right = (reading.curve(side, seen) if self._is_known(reading, side) else None for side in (0, 1))
         return RoadPrior(seen, left, right)
+
+    def _is_known(self, reading: RoadReading, side: int) -> bool:
+        is_there = reading.presence[side] >= self.detector.threshold
+        return bool(is_there and reading.deviations[side].mean() <= _MOST_DOUBT)
 
     def _reading(self, image: Image, horizon: float | None) -> tuple[RoadView, RoadReading]:
         prepared = self.detector.prepare(image, horizon)
