@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.regression import USUAL_HORIZON
+from lanestream.detection.regression import HORIZONS
 from lanestream.geometry import CanvasGeometry, RoadView
 from lanestream.lanes import FloatArray
 from lanestream_exporter.roadframes import RoadFrame
@@ -84,9 +84,10 @@ def sample(frame: RoadFrame, geometry: CanvasGeometry, warp: Warp) -> tuple[NDAr
 
 
 def plain_warp(frame: RoadFrame, known: bool) -> Warp:
-    """No move at all; the horizon where it is if `known`, else where cameras usually look."""
+    """No move at all; the horizon where it is if `known`, else where an unknown frame's best look takes it to be."""
     depth = frame.height - 1.0 - frame.horizon
-    return Warp(assumed=0.0 if known else (USUAL_HORIZON * frame.height - frame.horizon) / depth)
+    looks = [(share * frame.height - frame.horizon) / depth for share in HORIZONS]
+    return Warp(assumed=0.0 if known else min(looks, key=abs))
 
 
 def _source(columns: FloatArray, rows: FloatArray, view: RoadView, warp: Warp) -> tuple[FloatArray, FloatArray]:

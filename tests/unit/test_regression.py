@@ -155,10 +155,20 @@ def test_a_moved_frame_shows_its_paint_where_the_target_says(frame: RoadFrame, w
     assert target.horizon == pytest.approx((view.horizon - seen.horizon) / seen.depth)
 
 
-def test_a_plain_warp_takes_an_unknown_horizon_for_the_usual_one(frame: RoadFrame) -> None:
+def test_a_plain_warp_takes_an_unknown_horizon_for_the_nearest_look(frame: RoadFrame) -> None:
     assert plain_warp(frame, known=True) == Warp()
     depth = frame.height - 1.0 - frame.horizon
-    assert frame.horizon + plain_warp(frame, known=False).assumed * depth == pytest.approx(0.46 * frame.height)
+    assert frame.horizon + plain_warp(frame, known=False).assumed * depth == pytest.approx(0.39 * frame.height)
+
+
+def test_without_a_horizon_the_look_counts_that_found_it_where_it_was_taken_to_be() -> None:
+    detector = RegressionDetector()
+    prepared = detector.prepare(road())
+    assert prepared.inputs.shape == (5, 224, 224, 3)
+    offsets = [(HORIZON - view.horizon) / view.depth for view in prepared.looks]
+    outputs = np.stack([answer(offset) for offset in offsets])
+    assert detector.finish(prepared, outputs).view.horizon == pytest.approx(HORIZON)
+    assert abs(detector.read(prepared, outputs)[0].horizon) == pytest.approx(min(abs(o) for o in offsets))
 
 
 def test_frames_survive_their_file(frame: RoadFrame, tmp_path: Path) -> None:

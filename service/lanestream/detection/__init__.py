@@ -24,7 +24,7 @@ class Prepared:
     """A frame on its way through a detector: network inputs (N, H, W, 3) uint8, and what `finish` needs again.
 
     `view` is the road view that the inputs were made in, and `horizon_weight` (0 to 1) tells how much of its horizon
-    was found in this frame.
+    was found in this frame. `looks` are the views of the inputs one by one, where each has its own.
     """
 
     image: Image
@@ -32,6 +32,7 @@ class Prepared:
     view: RoadView
     candidates: tuple[Candidate, ...] = ()
     horizon_weight: float = 0.0
+    looks: tuple[RoadView, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from lanestream.detection import Network
 from lanestream.detection.regression import RegressionDetector, RoadReading
 from lanestream.geometry import RoadView
@@ -17,7 +15,7 @@ from lanestream.lanes import Curve, Image
 _MOST_DOUBT: Final = 0.1
 
 # A horizon farther than this from where it was taken to be, in depths, is worth a second look at the right place.
-_SECOND_LOOK: Final = 0.06
+_SECOND_LOOK: Final = 0.03
 
 
 @dataclass(frozen=True)
@@ -46,10 +44,9 @@ class RoadGlance:
 
     def look(self, image: Image, horizon: float | None = None) -> RoadPrior:
         """The prior for a BGR image (H, W, 3); `horizon` is about its row, where known."""
-        view, reading = self._reading(image, horizon)
+        reading, seen = self._reading(image, horizon)
         if abs(reading.horizon) > _SECOND_LOOK:
-            view, reading = self._reading(image, reading.view(view).horizon)
-        seen = reading.view(view)
+            reading, seen = self._reading(image, seen.horizon)
         left, right = (reading.curve(side, seen) if self._is_known(reading, side) else None for side in (0, 1))
         return RoadPrior(seen, left, right)
 
@@ -57,6 +54,6 @@ class RoadGlance:
         is_there = reading.presence[side] >= self.detector.threshold
         return bool(is_there and reading.deviations[side].mean() <= _MOST_DOUBT)
 
-    def _reading(self, image: Image, horizon: float | None) -> tuple[RoadView, RoadReading]:
+    def _reading(self, image: Image, horizon: float | None) -> tuple[RoadReading, RoadView]:
         prepared = self.detector.prepare(image, horizon)
-        return prepared.view, RoadReading.of(np.asarray(self.network.run(prepared.inputs)[0]))
+        return self.detector.read(prepared, self.network.run(prepared.inputs))

@@ -27,8 +27,8 @@ ANCHORS: Final = (1.0, 0.4, 0.15)
 # canvas took it to be, in depths, positive downwards.
 OUTPUTS: Final = 15
 
-# Where cameras look: the horizon of a frame of which nothing is known, as a share of its height.
-USUAL_HORIZON: Final = 0.46
+# Where the horizon of a frame of which nothing is known may be, as shares of its height: one look at each.
+HORIZONS: Final = (0.32, 0.39, 0.46, 0.53, 0.6)
 
 _TOP_SHARE: Final = 0.1
 
@@ -83,14 +83,22 @@ class RegressionDetector:
     def prepare(
         self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()  # noqa: ARG002
     ) -> Prepared:  # fmt: skip
-        """The canonical picture (1, size, size, 3) of a BGR image; `horizon` is about its row, where known.
+        """Canonical pictures (N, size, size, 3) of a BGR image; `horizon` is about its row, where known.
 
-        `expected` boundaries are of no use here: the network looks at every frame afresh.
+        With a horizon there is one, without one there is one for each of `HORIZONS`. `expected` boundaries are of no
+        use here: the network looks at every frame afresh.
         """
         height, width = image.shape[:2]
-        row = USUAL_HORIZON * height if horizon is None else horizon
-        view = RoadView(width, height, float(np.clip(row, 0.0, 0.85 * height)))
-        return Prepared(image, self.canvas(image, view)[None], view)
+        rows = [share * height for share in HORIZONS] if horizon is None else [horizon]
+        looks = tuple(RoadView(width, height, float(np.clip(row, 0.0, 0.85 * height))) for row in rows)
+        canvases = np.stack([self.canvas(image, view) for view in looks])
+        return Prepared(image, canvases, looks[0], looks=looks)
+
+    def read(self, prepared: Prepared, outputs: NDArray[np.float32]) -> tuple[RoadReading, RoadView]:
+        """The reading of the look whose horizon was nearest to where the network saw it, and the view with that."""
+        readings = [RoadReading.of(output) for output in outputs]
+        best = min(range(len(readings)), key=lambda i: abs(readings[i].horizon))
+        return readings[best], readings[best].view(prepared.looks[best])
 
     def canvas(self, image: Image, view: RoadView) -> NDArray[np.uint8]:
         """The canonical picture (size, size, 3) in RGB of a BGR image seen in `view`."""
@@ -107,9 +115,8 @@ class RegressionDetector:
         return np.asarray(cv2.cvtColor(canvas, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
-        """The boundaries in the network's outputs (1, 15), left to right, and the horizon that it saw."""
-        reading = RoadReading.of(outputs[0])
-        view = reading.view(prepared.view)
+        """The boundaries in the network's outputs (N, 15), left to right, and the horizon that it saw."""
+        reading, view = self.read(prepared, outputs)
         detections = []
         for side in (0, 1):
             curve = reading.curve(side, view)
