@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +19,7 @@ from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.normalisation import NORMALISATIONS
 from lanestream_exporter.exporting.proof import Measured
 from lanestream_exporter.exporting.subject import Precision
+from lanestream_exporter.training.config import PatchData
 
 _STRIP = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
 
@@ -39,7 +41,7 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
             given[key] = _STRIP[key](number)
         except ValueError:
             raise click.BadParameter(f"{key} must be a number, not {number!r}") from None
-        if not 0 < given[key] < float("inf"):
+        if not (0 < given[key] < math.inf or (key == "lean" and given[key] == 0)):
             raise click.BadParameter(f"{key} must be above 0")
     return StripGeometry(**given)
 
@@ -60,7 +62,8 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
 )  # fmt: skip
 @click.option(
     "--data", type=click.Path(path_type=Path), envvar="LANESTREAM_DATA", show_envvar=True,
-    help="Folder of real frames; without it rendered scenes alone are used.",
+    help="Folder of real frames; without it rendered scenes alone are used. What was trained on frames of your own is"
+    " proved on those.",
 )  # fmt: skip
 @click.option(
     "--scenes", type=click.IntRange(4), default=FrameSource.rendered, show_default=True,
@@ -82,11 +85,22 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
     foreign = _foreign(given["classes"], given["strip"], given["normalisation"])
     # What is no checkpoint is told now, not after the frames have been made.
     subject, training = read_subject(checkpoint, foreign)
-    source = FrameSource(data_root(given["data"]) if given["data"] else None, rendered=given["scenes"])
+    own = _own_frames(training)
+    root = data_root(given["data"]) if given["data"] and own is None else None
+    source = FrameSource(root, rendered=given["scenes"], own=own)
     settings = ExportSettings(
         given["name"] or subject.name, given["precision"], given["rank_energy"], given["tolerance"]
     )
     _tell(out, export_network(subject, out, settings, Provenance(training, source), click.echo), source)
+
+
+def _own_frames(training: dict[str, Any]) -> PatchData | None:
+    """The labelled frames that a network was trained on, where they were somebody's own and are here."""
+    data = training.get("config", {}).get("data", {})
+    paths = [frames["path"] for key in ("train", "validation") for frames in data.get(key, [])]
+    if not paths or not all(Path(path).exists() for path in paths):
+        return None
+    return PatchData.model_validate({key: data[key] for key in ("train", "validation", "validation_share")})
 
 
 def _foreign(classes: tuple[str, ...] | None, strip: StripGeometry | None, normalisation: str) -> Foreign | None:

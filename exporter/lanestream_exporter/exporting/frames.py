@@ -13,8 +13,10 @@ import numpy as np
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import real_frames
-from lanestream_exporter.roadframes import RoadFrame, real_road_frames
+from lanestream_exporter.roadframes import RoadFrame, road_frames
 from lanestream_exporter.scenes import render_still, sample_scene
+from lanestream_exporter.training.config import PatchData
+from lanestream_exporter.training.ownframes import own_frames
 
 # No test frame has a part in an export.
 Part = Literal["train", "val"]
@@ -37,7 +39,7 @@ class LabelledJpeg:
 
 @dataclass(frozen=True)
 class FrameSource:
-    """Rendered frames, `rendered` of each part, and the project's labelled real ones where `root` names their folder.
+    """Rendered frames, `rendered` of each part, and labelled real ones: those of `own`, or the project's below `root`.
 
     At most `real` real ones of a part are taken, evenly among all.
     """
@@ -45,25 +47,31 @@ class FrameSource:
     root: Path | None
     rendered: int = 48
     real: int = 96
+    own: PatchData | None = None
 
     @property
     def origin(self) -> str:
         """Where the frames come from, for people."""
+        if self.own is not None:
+            return f"rendered scenes and real frames of {', '.join(frames.path for frames in self.own.train)}"
         return "rendered scenes" if self.root is None else f"rendered scenes and real frames of {self.root}"
 
     def jpegs(self, part: Part) -> list[LabelledJpeg]:
         """Whole frames of `part` as JPEG files. Raises LabelError for real frames that can't be read."""
         rendered = [LabelledJpeg(_jpeg(image), labels) for labels, image, _ in self._rendered(part)]
-        if self.root is None:
-            return rendered
-        real = [LabelledJpeg(_jpeg(image), labels) for labels, image in real_frames(self.root, part)]
+        real = [LabelledJpeg(_jpeg(image), labels) for labels, image in self._labelled(part)]
         return [*_thinned(real, self.real), *rendered]
 
     def roads(self, part: Part) -> list[RoadFrame]:
         """Frames of `part` with their horizon, small. Raises LabelError for real frames that can't be read."""
         rendered = [RoadFrame.of(labels, image, horizon) for labels, image, horizon in self._rendered(part)]
-        real = [] if self.root is None else _thinned(real_road_frames(self.root, part), self.real)
+        real = _thinned(road_frames(self._labelled(part)), self.real)
         return [*real, *(frame for frame in rendered if frame is not None)]
+
+    def _labelled(self, part: Part) -> Iterator[tuple[LabelledFrame, Image]]:
+        if self.own is not None:
+            return own_frames(self.own)[0 if part == "train" else 1]
+        return iter(()) if self.root is None else real_frames(self.root, part)
 
     def _rendered(self, part: Part) -> Iterator[tuple[LabelledFrame, Image, float]]:
         for index in range(self.rendered):

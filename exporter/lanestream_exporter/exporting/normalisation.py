@@ -27,7 +27,8 @@ def contrast(images: Tensor) -> Tensor:
     centred = pixels - pixels.mean(dim=(1, 2, 3), keepdim=True)
     length = torch.linalg.vector_norm(centred, dim=(1, 2, 3), keepdim=True)
     deviation = length / (pixels.shape[1] * pixels.shape[2] * pixels.shape[3]) ** 0.5
-    return centred / (deviation + 255.0 * LEAST_CONTRAST)
+    normalised: Tensor = centred / (deviation + 255.0 * LEAST_CONTRAST)
+    return normalised
 
 
 # "contrast", each picture against its own brightness and contrast, is how this project trains.
