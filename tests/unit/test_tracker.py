@@ -209,3 +209,23 @@ def test_a_moving_horizon_changes_nothing() -> None:
     assert len({lane.track_id for lane in result.lanes}) == 2
     rows = np.array([350.0, 280.0, 230.0])
     np.testing.assert_allclose(result.lanes[1].curve.x(rows), truth.x(rows), atol=1.5)
+
+
+def test_a_boundary_that_turns_faster_than_the_filter_believes_is_still_the_same() -> None:
+    tracker = LaneTracker()
+    before = drive(tracker, 15, lambda _: road(0.0, (0, 1)))
+    sharp = 0.02 * VIEW.depth**2
+    after = tracker.update([detection(b + 0.15 * LANE, sharp) for b in (-1.15, 1.15)], 15 * DT, VIEW)
+    assert [lane.track_id for lane in after.lanes] == [lane.track_id for lane in before.lanes]
+    assert [lane.state for lane in after.lanes] == ["detected", "detected"]
+    rows = np.array([330.0, 260.0])
+    expected = Curve(160.0, (319.5, -1.15 + 0.15 * LANE, sharp)).x(rows)
+    np.testing.assert_allclose(after.lanes[0].curve.x(rows), expected, atol=3.0)
+
+
+def test_another_boundary_is_not_taken_for_one_that_is_lost() -> None:
+    tracker = LaneTracker()
+    before = drive(tracker, 15, lambda _: road(0.0, (0, 1)))
+    after = tracker.update([detection(-1.15 + 0.5 * LANE), detection(1.15)], 15 * DT, VIEW)
+    assert [lane.track_id for lane in after.lanes] == [lane.track_id for lane in before.lanes]
+    assert [lane.state for lane in after.lanes] == ["predicted", "detected"]

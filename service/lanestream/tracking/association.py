@@ -44,6 +44,32 @@ def associate(tracks: Sequence[Track], measured: Sequence[tuple[FloatArray, Floa
     return kept
 
 
+def recover(
+    tracks: Sequence[Track],
+    measured: Sequence[tuple[FloatArray, FloatArray]],
+    pairs: Sequence[tuple[int, int]],
+    reach: FloatArray,
+) -> list[tuple[int, int]]:
+    """Further (track, detection) pairs of what `pairs` leave over, nearer at the two near rows than `reach` (3,).
+
+    A road that turns faster than the filter believes takes a detection out of its track's gate. Where that is still by
+    far the nearest track there is, it is the same boundary, and the filter was wrong; nearest pairs first.
+    """
+    taken = {i for i, _ in pairs}, {j for _, j in pairs}
+    near = []
+    for i, track in enumerate(tracks):
+        for j, (columns, _) in enumerate(measured):
+            share = float((np.abs(columns - track.columns) / reach)[:2].max())
+            if share < 1.0 and track.confirmed and i not in taken[0] and j not in taken[1]:
+                near.append((share, i, j))
+    kept = list(pairs)
+    for _, i, j in sorted(near):
+        free = all(i != other[0] and j != other[1] for other in kept)
+        if free and not any(_swaps((i, j), other, tracks, measured) for other in kept):
+            kept.append((i, j))
+    return kept[len(pairs) :]
+
+
 def _swaps(
     one: tuple[int, int],
     other: tuple[int, int],

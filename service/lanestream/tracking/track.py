@@ -57,6 +57,10 @@ class Track:
         self.top += 0.3 * (detection.top - self.top)
         self.bottom += 0.3 * (detection.bottom - self.bottom)
 
+    def restart(self, kalman: KalmanFilter) -> None:
+        """Forgets the filter's past for a fresh `kalman`; the boundary stays who it is."""
+        self.kalman = kalman
+
     def miss(self) -> None:
         """Notes a frame without a detection."""
         self.hits.append(False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from lanestream.geometry import RoadView, visible_rows
 from lanestream.lanes import Curve, Detection, EgoLane, FloatArray, FrameResult, LaneBoundary, LaneChange
-from lanestream.tracking.association import associate
+from lanestream.tracking.association import associate, recover
 from lanestream.tracking.filter import Rows, boundary_filter, predict
 from lanestream.tracking.positions import LaneWidth, Sides, positions
 from lanestream.tracking.track import Track
@@ -22,17 +22,19 @@ class TrackerSettings:
 
     Boundaries are followed at the depths `shares`, where they accelerate by about `acceleration` per second squared and
     start with up to `speed` per second. A detection's own covariance is widened by `noise` and by a horizon that nods
-    by `nod`. A track is confirmed by `birth[0]` hits in `birth[1]` frames and coasts for `coast_s` seconds. Tracks of
-    one marking, nearer than `merge` lane widths, become one.
+    by `nod`. A track is confirmed by `birth[0]` hits in `birth[1]` frames and coasts for `coast_s` seconds. One that a
+    detection leaves behind by less than `recover` lane widths starts again there. Tracks of one marking, nearer than
+    `merge` lane widths, become one.
     """
 
     shares: tuple[float, float, float] = (1.0, 0.5, 0.2)
-    acceleration: tuple[float, float, float] = (1.5, 0.8, 0.5)
+    acceleration: tuple[float, float, float] = (2.5, 1.6, 1.0)
     speed: tuple[float, float, float] = (1.0, 0.5, 0.3)
     noise: float = 0.012
     nod: float = 0.006
     birth: tuple[int, int] = (3, 5)
     coast_s: float = 0.7
+    recover: float = 0.3
     merge: float = 0.35
 
 
@@ -70,6 +72,10 @@ class LaneTracker:
         self._forget()
         measured = [self._measured(detection, rows, view) for detection in detections]
         pairs = associate(self._tracks, measured)
+        lost = recover(self._tracks, measured, pairs, self._lane_widths(self._settings.recover, view))
+        for i, j in lost:
+            self._tracks[i].restart(boundary_filter(*measured[j], self._scaled(self._settings.speed, view)))
+        pairs += lost
         for i, j in pairs:
             self._tracks[i].hit(detections[j], *measured[j], self._clock)
         matched = {i for i, _ in pairs}
@@ -103,6 +109,10 @@ class LaneTracker:
 
     def _scaled(self, shares: tuple[float, float, float], view: RoadView) -> FloatArray:
         return np.asarray(shares) * view.depth
+
+    def _lane_widths(self, number: float, view: RoadView) -> FloatArray:
+        """`number` lane widths in pixels at the rows that boundaries are followed at (3,)."""
+        return number * self._width.value * self._scaled(self._settings.shares, view)
 
     def _predict(self, seconds: float, view: RoadView) -> None:
         acceleration = self._scaled(self._settings.acceleration, view)
@@ -166,7 +176,7 @@ class LaneTracker:
     def _merged(self, tracks: list[Track], view: RoadView) -> list[Track]:
         """Of tracks that have run together the oldest stays, with its identity."""
         kept: list[Track] = []
-        least = self._settings.merge * self._width.value * self._scaled(self._settings.shares, view)
+        least = self._lane_widths(self._settings.merge, view)
         for track in sorted(tracks, key=lambda t: (not t.confirmed, t.born, t.track_id or 0)):
             if not any(bool((np.abs(track.columns - other.columns) < least)[:2].all()) for other in kept):
                 kept.append(track)
