@@ -24,7 +24,7 @@ from lanestream_exporter.scenes import render_still, sample_scene
 
 SCENES_PER_FILE = 250
 
-_ROUNDS = 3
+_ROUNDS = 5
 
 # Sizes of rendered stills and how often each is drawn: cameras differ, and so does how sharp a strip is.
 _SIZES = ((640, 360), (640, 480), (960, 540), (1280, 720))

@@ -50,7 +50,8 @@ class ClassifierTask:
     def loss(self, network: nn.Module, batch: Batch) -> Tensor:
         """The cross entropy, with smoothed labels."""
         patches, labels = batch
-        logits: Tensor = network(normalise(patches))
+        # Convolutions on the CPU are faster with the channels last.
+        logits: Tensor = network(normalise(patches).contiguous(memory_format=torch.channels_last))
         return functional.cross_entropy(logits.float(), labels, label_smoothing=self._config.label_smoothing)
 
     def check(self, network: nn.Module) -> dict[str, float]:

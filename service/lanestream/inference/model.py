@@ -18,7 +18,7 @@ BUCKETS = (1, 2, 4, 8, 16)
 
 
 class OnnxModel:
-    """A loaded network. One thread at a time runs it.
+    """A loaded network. Threads may run it at once, though a device gains little from that.
 
     `info` is the file's own description, `provider` the execution provider that really runs it (`cpu`, `cuda`) and
     `reason` why that one.

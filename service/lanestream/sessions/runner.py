@@ -1,7 +1,7 @@
 """The way of a frame through the threads, so that the event loop never decodes, proposes, infers or tracks.
 
-A small pool does what OpenCV and numpy do; one thread of its own runs the network, because one network on one device
-gains nothing from being run twice at a time.
+A small pool does what OpenCV and numpy do, a glance of the regressor among it; one thread of its own runs the network
+between the halves of a detector, because one network on one device gains nothing from being run twice at a time.
 """
 
 from __future__ import annotations
