@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from lanestream.detection import DetectorName, LaneDetector, Network, Pipeline
+from lanestream.detection import LaneDetector, Network, Pipeline
 from lanestream.detection.detector import CandidateDetector
 from lanestream.detection.prior import RoadGlance
 from lanestream.detection.regression import RegressionDetector
@@ -18,6 +18,7 @@ from lanestream.geometry import CanvasGeometry, StripGeometry
 from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
 from lanestream.inference.providers import Provider
 from lanestream.lanes import FrameResult, Image
+from lanestream.protocol import DetectorName
 from lanestream.sessions import Session
 
 # The networks that are shipped, and served where no others are named.

@@ -13,11 +13,11 @@ from lanestream.messages import ProcessedFrame, lanes_message
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lanestream.detection import DetectorName, Network
+    from lanestream.detection import Network
     from lanestream.engine import Engine
     from lanestream.inference.providers import Provider
     from lanestream.lanes import Image
-    from lanestream.protocol import LanesMessage
+    from lanestream.protocol import DetectorName, LanesMessage
     from lanestream.sessions import Session
 
 # Who decodes a file of their own may give it more memory than a service gives to strangers.

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve, Detection, Image
-
-DetectorName = Literal["candidates", "regression"]
+from lanestream.protocol import DetectorName
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from lanestream.errors import BusyError
 
 if TYPE_CHECKING:
-    from lanestream.detection import DetectorName
     from lanestream.engine import Engine
+    from lanestream.protocol import DetectorName
     from lanestream.sessions.session import Session
 
 
