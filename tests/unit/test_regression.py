@@ -61,7 +61,16 @@ class Told:
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.seen.append(inputs)
-        return self.answers.pop(0)[None]
+        return both(self.answers.pop(0)[None])
+
+
+def both(outputs: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Answers (N, 15) to straight canvases, and the same answers (2 N, 15) to them and to their mirrored copies."""
+    mirrored = outputs.copy()
+    mirrored[:, :3], mirrored[:, 3:6] = -outputs[:, 3:6], -outputs[:, :3]
+    mirrored[:, 6:9], mirrored[:, 9:12] = outputs[:, 9:12], outputs[:, 6:9]
+    mirrored[:, 12:14] = outputs[:, [13, 12]]
+    return np.concatenate([outputs, mirrored])
 
 
 def answer(horizon: float = 0.0, presence: tuple[float, float] = (0.9, 0.9)) -> NDArray[np.float32]:
@@ -82,8 +91,9 @@ def test_the_answer_is_read_as_the_curves_it_was_made_of() -> None:
 def test_boundaries_are_told_from_the_threshold_on_with_the_horizon_that_was_seen() -> None:
     detector = RegressionDetector(threshold=0.5)
     prepared = detector.prepare(road(), HORIZON)
-    assert prepared.inputs.shape == (1, 224, 224, 3)
-    found = detector.finish(prepared, answer(0.1, (0.4, 0.9))[None])
+    assert prepared.inputs.shape == (2, 224, 224, 3)
+    np.testing.assert_array_equal(prepared.inputs[1], prepared.inputs[0, :, ::-1])
+    found = detector.finish(prepared, both(answer(0.1, (0.4, 0.9))[None]))
     assert [d.probability for d in found.detections] == [pytest.approx(0.9)]
     assert found.view.horizon == pytest.approx(HORIZON + 0.1 * VIEW.depth)
 
@@ -164,9 +174,9 @@ def test_a_plain_warp_takes_an_unknown_horizon_for_the_nearest_look(frame: RoadF
 def test_without_a_horizon_the_look_counts_that_found_it_where_it_was_taken_to_be() -> None:
     detector = RegressionDetector()
     prepared = detector.prepare(road())
-    assert prepared.inputs.shape == (5, 224, 224, 3)
+    assert prepared.inputs.shape == (10, 224, 224, 3)
     offsets = [(HORIZON - view.horizon) / view.depth for view in prepared.looks]
-    outputs = np.stack([answer(offset) for offset in offsets])
+    outputs = both(np.stack([answer(offset) for offset in offsets]))
     assert detector.finish(prepared, outputs).view.horizon == pytest.approx(HORIZON)
     assert abs(detector.read(prepared, outputs)[0].horizon) == pytest.approx(min(abs(o) for o in offsets))
 

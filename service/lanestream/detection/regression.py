@@ -52,6 +52,20 @@ class RoadReading:
         values = np.asarray(output, dtype=np.float64)
         return cls(values[:6].reshape(2, 3), values[6:12].reshape(2, 3), values[12:14], float(values[14]))
 
+    @property
+    def mirrored(self) -> RoadReading:
+        """What the reading of a mirrored canvas says of the canvas itself."""
+        return RoadReading(-self.columns[::-1], self.deviations[::-1], self.presence[::-1], self.horizon)
+
+    def mean(self, other: RoadReading) -> RoadReading:
+        """The mean of two readings of one canvas."""
+        return RoadReading(
+            0.5 * (self.columns + other.columns),
+            0.5 * (self.deviations + other.deviations),
+            0.5 * (self.presence + other.presence),
+            0.5 * (self.horizon + other.horizon),
+        )
+
     def view(self, assumed: RoadView) -> RoadView:
         """The road view with the horizon where the network sees it."""
         horizon = assumed.horizon + self.horizon * assumed.depth
@@ -83,20 +97,26 @@ class RegressionDetector:
     def prepare(
         self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()  # noqa: ARG002
     ) -> Prepared:  # fmt: skip
-        """Canonical pictures (N, size, size, 3) of a BGR image; `horizon` is about its row, where known.
+        """Canonical pictures (2 N, size, size, 3) of a BGR image; `horizon` is about its row, where known.
 
-        With a horizon there is one, without one there is one for each of `HORIZONS`. `expected` boundaries are of no
-        use here: the network looks at every frame afresh.
+        With a horizon N is 1, without one there is a look for each of `HORIZONS`. Every look is taken twice, straight
+        and mirrored: the network's errors are not the same in both. `expected` boundaries are of no use here, because
+        the network looks at every frame afresh.
         """
         height, width = image.shape[:2]
         rows = [share * height for share in HORIZONS] if horizon is None else [horizon]
         looks = tuple(RoadView(width, height, float(np.clip(row, 0.0, 0.85 * height))) for row in rows)
         canvases = np.stack([self.canvas(image, view) for view in looks])
-        return Prepared(image, canvases, looks[0], looks=looks)
+        both = np.concatenate([canvases, canvases[:, :, ::-1]])
+        return Prepared(image, both, looks[0], looks=looks)
 
     def read(self, prepared: Prepared, outputs: NDArray[np.float32]) -> tuple[RoadReading, RoadView]:
         """The reading of the look whose horizon was nearest to where the network saw it, and the view with that."""
-        readings = [RoadReading.of(output) for output in outputs]
+        straight, mirrored = np.split(outputs, 2)
+        readings = [
+            RoadReading.of(one).mean(RoadReading.of(other).mirrored)
+            for one, other in zip(straight, mirrored, strict=True)
+        ]
         best = min(range(len(readings)), key=lambda i: abs(readings[i].horizon))
         return readings[best], readings[best].view(prepared.looks[best])
 
@@ -115,7 +135,7 @@ class RegressionDetector:
         return np.asarray(cv2.cvtColor(canvas, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
-        """The boundaries in the network's outputs (N, 15), left to right, and the horizon that it saw."""
+        """The boundaries in the network's outputs (2 N, 15), left to right, and the horizon that it saw."""
         reading, view = self.read(prepared, outputs)
         detections = []
         for side in (0, 1):
