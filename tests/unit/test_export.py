@@ -103,6 +103,17 @@ def test_the_regressors_file_says_what_its_answer_is(regressor: Exported) -> Non
     assert regressor.report.time_ratio is None
 
 
+def test_of_the_looks_at_a_frame_the_nearest_alone_is_judged(regressor: Exported) -> None:
+    check = regressor.check
+    assert {len(values) for values in check.truth.values()} == {len(check.inputs)}
+    assert [len(prepared.inputs) for prepared in check.prepared[:2]] == [1, 5]
+    judged = check.truth["known"].any(axis=(1, 2))
+    assert judged[:6].sum() == 2
+    assert judged[0]
+    assert (check.truth["presence"][~judged] == -1.0).all()
+    assert check.frames == len(check.prepared) // 2
+
+
 def test_the_regressors_small_layers_stay_exact_in_int8(regressor: Exported, tmp_path: Path) -> None:
     subject = regressor.report.subject
     small = tmp_path / "int8.onnx"

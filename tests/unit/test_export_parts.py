@@ -122,10 +122,10 @@ def test_labels_that_are_all_alike_calibrate_nothing() -> None:
 
 
 def test_boundaries_of_two_answers_are_compared_in_columns() -> None:
-    prepared = Prepared(
-        np.zeros((360, 640, 3), np.uint8), np.zeros((1, 224, 224, 3), np.uint8), RoadView(640, 360, 160.0)
-    )
-    check = Check((prepared, prepared), {})
+    view = RoadView(640, 360, 160.0)
+    images = np.zeros((360, 640, 3), np.uint8), np.zeros((1, 224, 224, 3), np.uint8)
+    prepared = Prepared(*images, view, looks=(view,))
+    check = Check(2, (prepared, prepared), {})
     both = np.array([[-0.3, -0.12, -0.05, 0.3, 0.12, 0.05, *[0.01] * 6, 0.9, 0.9, 0.0]], np.float32)
     moved, single = both.copy(), both.copy()
     moved[:, :6] += 0.001  # 0.64 pixels

@@ -77,7 +77,7 @@ class ClassifierSubject:
         """All candidates of validation frames, judged by the rule that training judges by. Raises LabelError."""
         pairs = list(self._prepared(source, "val"))
         verdicts = [TruthRule().judge(prepared.candidates, frame.labels, prepared.view) for prepared, frame in pairs]
-        return Check(tuple(prepared for prepared, _ in pairs), {"verdict": np.concatenate(verdicts)})
+        return Check(len(pairs), tuple(prepared for prepared, _ in pairs), {"verdict": np.concatenate(verdicts)})
 
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> ClassifierSubject:
         """With thinner hidden layers."""

@@ -147,7 +147,7 @@ def _measured(whole: Subject, subject: Subject, check: Check, files: dict[Precis
         rows[name] = Measured(name, figures, mean, largest, path.stat().st_size, times[name])
     return ExportReport(
         subject,
-        len(check.prepared),
+        check.frames,
         len(check.inputs),
         Measured("checkpoint", subject.figures(checkpoint, check)),
         rows["fp32"],

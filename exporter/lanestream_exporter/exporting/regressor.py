@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lanestream.detection import Prepared
 from lanestream.detection.regression import RegressionDetector
 from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import CanvasInfo, RegressorInfo
@@ -80,16 +81,26 @@ class RegressorSubject:
         return np.stack([canvases[i] for i in rng.permutation(len(canvases))[:_MOST_RANGING]])
 
     def check(self, source: FrameSource) -> Check:
-        """Validation frames, each with its horizon known and not known. Raises LabelError."""
-        prepared, targets = [], []
-        for frame in source.roads("val"):
+        """Validation frames, each with its horizon known and not known. Raises LabelError.
+
+        Of the looks at a frame whose horizon is not known all are compared with PyTorch's, but only the nearest one
+        is judged.
+        """
+        prepared: list[Prepared] = []
+        truth: dict[str, list[NDArray[np.float32]]] = {"columns": [], "known": [], "presence": []}
+        frames = source.roads("val")
+        for frame in frames:
             image = decode(frame.jpeg, ImageLimits())
+            target = sample(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
             for horizon in (frame.horizon, None):
                 prepared.append(self.detector.prepare(image, horizon))
-                warp = plain_warp(frame, known=horizon is not None)
-                targets.append(sample(frame, self.detector.geometry, warp)[1])
-        names = ("columns", "known", "presence", "horizon")
-        return Check(tuple(prepared), {name: np.array([getattr(t, name) for t in targets]) for name in names})
+                looks = prepared[-1].looks
+                nearest = min(looks, key=lambda look: abs(look.horizon - frame.horizon))
+                for look in looks:
+                    truth["columns"].append(target.columns)
+                    truth["known"].append(target.known * (look is nearest))
+                    truth["presence"].append(np.where(look is nearest, target.presence, -1.0))
+        return Check(len(frames), tuple(prepared), {name: np.array(values) for name, values in truth.items()})
 
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> RegressorSubject:
         """With a thinner hidden layer."""

@@ -24,9 +24,11 @@ Figures = dict[str, float]
 class Check:
     """Frames that prove a file, on their way from JPEG bytes through the detector, and what is true of their inputs.
 
-    `truth` has an entry for each row of `inputs`.
+    Of `frames` frames; one that is looked at in different ways is prepared more than once. `truth` has an entry for
+    each row of `inputs`.
     """
 
+    frames: int
     prepared: tuple[Prepared, ...]
     truth: dict[str, NDArray[Any]]
 
