@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from lanestream.detection import Findings, Prepared
 from lanestream.detection.edges import resized
+from lanestream.detection.refinement import Refinement
 from lanestream.geometry import CanvasGeometry, RoadView, Scaling, visible_rows
-from lanestream.lanes import Curve, Detection, FloatArray, Image, curve_basis
+from lanestream.lanes import Candidate, Curve, Detection, FloatArray, Image
 
 # A boundary is told by its columns at these shares of the depth below the horizon.
 ANCHORS: Final = (1.0, 0.4, 0.15)
@@ -75,24 +76,19 @@ class RoadReading:
         """The boundary on `side` (0 left, 1 right) in pixels of `view`, the view with the network's horizon."""
         return Curve.through(view.horizon, _anchor_rows(view), _middle(view) + self.columns[side] * view.width)
 
-    def covariance(self, side: int, view: RoadView) -> FloatArray:
-        """The covariance (3, 3) of that curve's coefficients."""
-        to_curve = np.linalg.inv(curve_basis(view.horizon, _anchor_rows(view)))
-        variance = (self.deviations[side] * view.width) ** 2
-        return np.asarray((to_curve * variance) @ to_curve.T)
-
 
 @dataclass(frozen=True)
 class RegressionDetector:
     """Finds the ego lane's boundaries with one look at the whole frame.
 
-    A boundary is told from the presence `threshold` on. `detail_width` is the width that frames are reduced to before
-    they are warped, so that near rows do not alias.
+    A boundary is told from the presence `threshold` on, after `refinement` has moved it onto the paint beneath it.
+    `detail_width` is the width that frames are reduced to before they are warped, so that near rows do not alias.
     """
 
     threshold: float = 0.5
     geometry: CanvasGeometry = CanvasGeometry()
     detail_width: int = 448
+    refinement: Refinement = Refinement(reach=0.24, steps=(0.09, 0.06, 0.04, 0.04))
 
     def prepare(
         self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()  # noqa: ARG002
@@ -137,13 +133,19 @@ class RegressionDetector:
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
         """The boundaries in the network's outputs (2 N, 15), left to right, and the horizon that it saw."""
         reading, view = self.read(prepared, outputs)
-        detections = []
+        sides, candidates = [], []
         for side in (0, 1):
             curve = reading.curve(side, view)
             rows = visible_rows(curve, view, _TOP_SHARE)
             if reading.presence[side] >= self.threshold and rows is not None:
-                covariance = reading.covariance(side, view)
-                detections.append(Detection(curve, covariance, *rows, float(reading.presence[side])))
+                sides.append(side)
+                candidates.append(Candidate(curve, *rows, 1.0))
+        fits = self.refinement.refine(prepared.image, candidates, view)
+        detections = []
+        for side, fit in zip(sides, fits, strict=True):
+            rows = visible_rows(fit.curve, view, _TOP_SHARE)
+            if rows is not None:
+                detections.append(Detection(fit.curve, fit.covariance, *rows, float(reading.presence[side])))
         return Findings(tuple(detections), view, float(reading.presence.max()))
 
 
