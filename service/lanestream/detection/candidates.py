@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ LOWEST_HORIZON = 0.9
 
 # The two rows, as shares of the depth, at which lines are told, compared and suppressed.
 _NEAR, _FAR = 1.0, 0.45
+
+
+Source = Literal["pairs", "singles", "rays"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class _Line:
 class CandidateSearch:
     """How candidates are found: Hough lines and their pairs, lines of the fan, then suppression.
 
+    Lines come from `sources`: pairs of Hough edges that bound a marking, single ones, and rays of the fan.
     `perspective` looks for the road's perspective around a guess, `near_prior` around what a prior says of it. `limit`
     is the most candidates of a frame. Two edges are one marking where their distance is `least_width` to `most_width`
     times the rows below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for double lines).
@@ -68,6 +73,7 @@ class CandidateSearch:
     hough: ExtendedHough = ExtendedHough()
     vanishing: VanishingPointSearch = VanishingPointSearch()
     perspective: PerspectiveSearch = PerspectiveSearch()
+    sources: tuple[Source, ...] = ("pairs", "singles", "rays")
     near_prior: PerspectiveSearch = PerspectiveSearch(spread_x=0.03, nod=0.01, spread_bend=0.015)
     fan: Fan = Fan()
     limit: int = 16
@@ -135,8 +141,12 @@ class CandidateSearch:
 
     def _ranked(self, grey: Image, view: RoadView, point: Perspective, lines: HoughLines) -> list[_Line]:
         """Lines of both searches in one order: each list's strengths count against its own strongest."""
-        hough = self._pairs(lines, view, point) + self._singles(lines, view, point)
-        return sorted(_normalised(hough) + _normalised(self._rays(grey, view, point)), key=lambda line: -line.strength)
+        hough = [
+            *(self._pairs(lines, view, point) if "pairs" in self.sources else ()),
+            *(self._singles(lines, view, point) if "singles" in self.sources else ()),
+        ]
+        rays = self._rays(grey, view, point) if "rays" in self.sources else []
+        return sorted(_normalised(hough) + _normalised(rays), key=lambda line: -line.strength)
 
     def _rays(self, grey: Image, view: RoadView, point: Perspective) -> list[_Line]:
         found = self.fan.lines(grey, point)
