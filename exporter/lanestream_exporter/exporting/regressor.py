@@ -96,10 +96,12 @@ class RegressorSubject:
                 prepared.append(self.detector.prepare(image, horizon))
                 looks = prepared[-1].looks
                 nearest = min(looks, key=lambda look: abs(look.horizon - frame.horizon))
-                for look in looks:
-                    truth["columns"].append(target.columns)
-                    truth["known"].append(target.known * (look is nearest))
-                    truth["presence"].append(np.where(look is nearest, target.presence, -1.0))
+                # The detector's order: all looks straight, then all of them mirrored, where left is right.
+                for sign in (1, -1):
+                    for look in looks:
+                        truth["columns"].append(sign * target.columns[::sign])
+                        truth["known"].append(target.known[::sign] * (look is nearest))
+                        truth["presence"].append(np.where(look is nearest, target.presence[::sign], -1.0))
         return Check(len(frames), tuple(prepared), {name: np.array(values) for name, values in truth.items()})
 
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> RegressorSubject:
