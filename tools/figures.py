@@ -1,0 +1,141 @@
+"""The tables of the model card, from the file that `lanestream evaluate --json` wrote."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+Groups = Mapping[str, Any]
+
+
+@click.command()
+@click.argument("path", type=click.Path(path_type=Path), default=Path("out/evaluation.json"))
+def main(path: Path) -> None:
+    """Print every table of the model card as Markdown, from PATH."""
+    figures = json.loads(path.read_text(encoding="utf-8"))
+    images, clips = figures["images"], figures["clips"]
+    for title, head, rows in (
+        ("A. Candidates", _CANDIDATES, _rows(images, _candidates)),
+        ("Proposal recall", _PROPOSED, _rows(images, _proposed)),
+        ("B. Single images", _BOUNDARIES, _rows(images, lambda groups: _boundaries(groups["boundaries"]))),
+        ("B. With the tracker", _BOUNDARIES, _rows(clips, lambda groups: _boundaries(groups["tracked"]))),
+        ("B. The same frames without", _BOUNDARIES, _rows(clips, lambda groups: _boundaries(groups["alone"]))),
+        ("Steadiness", _STEADY, _rows(clips, _steady)),
+        ("Lateral error", _LATERAL, _rows(images, _lateral)),
+        ("C. The field's metrics", _FIELD, _rows(images, _field)),
+    ):
+        click.echo(f"\n**{title}**\n")
+        for row in (("", *head), ["---"] * (len(head) + 1), *rows):
+            click.echo("| " + " | ".join(row) + " |")
+
+
+_CANDIDATES = ("precision", "recall", "accuracy", "average precision", "base rate", "unsure, unknown")
+_PROPOSED = ("ego, 8", "ego, 16", "ego, 32", "all, 8", "all, 16", "all, 32")
+_BOUNDARIES = ("ego precision", "ego recall", "ego error, px", "all precision", "all recall")
+_STEADY = ("both ego boundaries", "jitter, px", "identity switches")
+_LATERAL = ("10 m, px", "of a constant's", "30 m, px", "of a constant's")
+_FIELD = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
+
+
+def _rows(methods: Mapping[str, Any], cells: Any) -> Iterable[list[str]]:
+    """A row for each drive and method that has such figures."""
+    for drive in next(iter(methods.values())):
+        for method, drives in methods.items():
+            row = cells(drives[drive])
+            if row:
+                yield [f"{drive}, {method}", *row]
+
+
+def _candidates(groups: Groups) -> list[str]:
+    if "candidates" not in groups:
+        return []
+    part = groups["candidates"]["far_40"]
+    tp, fp, fn, tn = (part["confusion"][key] for key in ("tp", "fp", "fn", "tn"))
+    return [
+        _counted(part, "precision", tp, tp + fp),
+        _counted(part, "recall", tp, tp + fn),
+        _counted(part, "accuracy", tp + tn, tp + fp + fn + tn),
+        _share(part["average_precision"]),
+        _share(part["base_rate"]),
+        f"{part['unsure']}, {part['unknown']}",
+    ]
+
+
+def _proposed(groups: Groups) -> list[str]:
+    if "candidates" not in groups:
+        return []
+    parts = [groups["candidates"]["proposal_recall"][which] for which in ("ego", "all")]
+    return [
+        f"{_share(part['recall'][number - 1])} ({part['found'][number - 1]} / {part['labels']})"
+        for part in parts
+        for number in (8, 16, 32)
+    ]
+
+
+def _boundaries(part: Groups) -> list[str]:
+    cells = []
+    for which in ("ego", "all"):
+        group = part[which]
+        right, wrong, missed = (group[key] for key in ("right", "wrong", "missed"))
+        cells += [_counted(group, "precision", right, right + wrong), _counted(group, "recall", right, right + missed)]
+        if which == "ego":
+            cells.append(_pixels(group["mean_error_px_640"]))
+    return cells
+
+
+def _steady(groups: Groups) -> list[str]:
+    if "steadiness" not in groups:
+        return []
+    steady = groups["steadiness"]
+    switches = steady["id_switches"]
+    return [
+        f"{_share(steady['both_ego'])} ({steady['both_ego_frames']} / {steady['frames']})",
+        _pixels(steady["jitter_px_640"]),
+        "-" if switches is None else str(switches),
+    ]
+
+
+def _lateral(groups: Groups) -> list[str]:
+    cells = []
+    for place in ("10m", "30m"):
+        part = groups["lateral"][place]
+        cells += [
+            f"{_pixels(part['mean_px_640'])} ({part['told']} of {part['labelled']})",
+            f"{_share(part['ratio'])}{_interval(part, 'ratio')}",
+        ]
+    return cells
+
+
+def _field(groups: Groups) -> list[str]:
+    tusimple, culane = groups["field"]["tusimple"], groups["field"]["culane"]
+    return [
+        f"{_share(tusimple['accuracy'])}{_interval(tusimple, 'accuracy')}",
+        _share(tusimple["fp"]),
+        _share(tusimple["fn"]),
+        f"{_share(culane['f1'])} ({culane['tp']} right, {culane['fp']} wrong, {culane['fn']} missed)",
+    ]
+
+
+def _counted(group: Groups, key: str, part: int, whole: int) -> str:
+    return f"{_share(group[key])} ({part} / {whole}){_interval(group, key)}"
+
+
+def _interval(group: Groups, key: str) -> str:
+    bounds = group["intervals"][key]
+    return "" if bounds is None else f" [{bounds[0]:.2f}, {bounds[1]:.2f}]"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _pixels(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+if __name__ == "__main__":
+    main()
