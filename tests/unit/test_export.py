@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from lanestream.engine import load_engine
 from lanestream.errors import ExportError, ModelError, ProviderError
@@ -103,15 +104,21 @@ def test_the_regressors_file_says_what_its_answer_is(regressor: Exported) -> Non
     assert regressor.report.time_ratio is None
 
 
-def test_of_the_looks_at_a_frame_the_nearest_alone_is_judged(regressor: Exported) -> None:
-    check = regressor.check
-    assert {len(values) for values in check.truth.values()} == {len(check.inputs)}
-    assert [len(prepared.inputs) for prepared in check.prepared[:2]] == [1, 5]
-    judged = check.truth["known"].any(axis=(1, 2))
-    assert judged[:6].sum() == 2
-    assert judged[0]
-    assert (check.truth["presence"][~judged] == -1.0).all()
-    assert check.frames == len(check.prepared) // 2
+def test_the_regressor_is_judged_by_what_its_detector_reads(regressor: Exported) -> None:
+    check, subject = regressor.check, regressor.report.subject
+    assert {len(values) for values in check.truth.values()} == {len(check.prepared)} == {2 * check.frames}
+    good = replace(check, truth={**check.truth, "columns": subject._read(_outputs(regressor), check)[0]})  # type: ignore[attr-defined]
+    figures = subject.figures(_outputs(regressor), good)
+    assert figures["accuracy"] == 1.0
+    assert figures["error_near_px"] == figures["error_far_px"] == 0.0
+    off = replace(good, truth={**good.truth, "columns": good.truth["columns"] + 0.01})
+    figures = subject.figures(_outputs(regressor), off)
+    assert figures["accuracy"] == 0.0
+    assert figures["error_near_px"] == pytest.approx(6.4)
+
+
+def _outputs(made: Exported) -> NDArray[np.float32]:
+    return OnnxModel.load(made.path, "cpu").run(made.check.inputs)
 
 
 def test_the_regressors_small_layers_stay_exact_in_int8(regressor: Exported, tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ from lanestream.detection import Prepared
 from lanestream.detection.regression import RegressionDetector
 from lanestream.errors import ExportError
 from lanestream.geometry import RoadView
+from lanestream.lanes import Curve, Detection
 from lanestream_exporter.alexnet import AlexNet, normalise
+from lanestream_exporter.exporting import proof
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import truncated
 from lanestream_exporter.exporting.graph import publish
@@ -123,17 +125,25 @@ def test_labels_that_are_all_alike_calibrate_nothing() -> None:
 
 def test_boundaries_of_two_answers_are_compared_in_columns() -> None:
     view = RoadView(640, 360, 160.0)
-    images = np.zeros((360, 640, 3), np.uint8), np.zeros((1, 224, 224, 3), np.uint8)
+    images = np.zeros((360, 640, 3), np.uint8), np.zeros((2, 224, 224, 3), np.uint8)
     prepared = Prepared(*images, view, looks=(view,))
     check = Check(2, (prepared, prepared), {})
-    both = np.array([[-0.3, -0.12, -0.05, 0.3, 0.12, 0.05, *[0.01] * 6, 0.9, 0.9, 0.0]], np.float32)
-    moved, single = both.copy(), both.copy()
-    moved[:, :6] += 0.001  # 0.64 pixels
-    single[:, 13] = 0.1
-    found = boundaries(RegressionDetector(), check, np.concatenate([both, both]), np.concatenate([moved, single]))
-    assert (found.both, found.alone) == (3, 1)
-    assert found.mean == pytest.approx(2 * 0.64 / 3, rel=0.05)
-    assert found.largest == pytest.approx(0.64, rel=0.05)
+    straight = [-0.3, -0.12, -0.05, 0.3, 0.12, 0.05, *[0.01] * 6, 0.9, 0.9, 0.0]
+    both = np.array([straight, straight], np.float32)  # straight and mirrored, which are alike here
+    single = both.copy()
+    single[0, 13] = single[1, 12] = 0.0
+    same, other = (np.concatenate([both, part]) for part in (both, single))
+    found = boundaries(RegressionDetector(), check, same, other)
+    assert (found.both, found.alone, found.mean, found.largest) == (3, 1, 0.0, 0.0)
+
+
+def test_the_columns_of_boundaries_that_both_found_are_compared() -> None:
+    def moved(by: float) -> list[Detection]:
+        return [Detection(Curve(100.0, (320.0 + by, b, 0.0)), np.eye(3), 200.0, 350.0, 0.9) for b in (-1.0, 1.0)]
+
+    pairs = proof._paired(moved(0.0), moved(1.5), scale=0.5)
+    assert [gap.max() for gap in pairs] == pytest.approx([0.75, 0.75])
+    assert not proof._paired(moved(0.0), moved(40.0), scale=0.5)
 
 
 def test_a_file_that_can_not_be_written_is_told_and_nothing_is_left(tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import logit
 from torch import Tensor, nn
 
-from lanestream.detection import Prepared
 from lanestream.detection.regression import RegressionDetector
 from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import CanvasInfo, RegressorInfo
+from lanestream.lanes import FloatArray
 from lanestream_exporter.canvases import SHARES, Warp, plain_warp, sample
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import in_batches, truncated
@@ -23,7 +24,7 @@ from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.normalisation import contrast
 from lanestream_exporter.exporting.subject import Check, Description, Figures
 from lanestream_exporter.exporting.versions import exporter, product
-from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares
+from lanestream_exporter.regressor import Answer, LaneRegressor
 from lanestream_exporter.roadframes import RoadFrame
 
 _MOST_RANGING: Final = 1024
@@ -81,28 +82,18 @@ class RegressorSubject:
         return np.stack([canvases[i] for i in rng.permutation(len(canvases))[:_MOST_RANGING]])
 
     def check(self, source: FrameSource) -> Check:
-        """Validation frames, each with its horizon known and not known. Raises LabelError.
-
-        Of the looks at a frame whose horizon is not known all are compared with PyTorch's, but only the nearest one
-        is judged.
-        """
-        prepared: list[Prepared] = []
-        truth: dict[str, list[NDArray[np.float32]]] = {"columns": [], "known": [], "presence": []}
+        """Validation frames, each with its horizon known and not known. Raises LabelError."""
+        prepared, targets = [], []
         frames = source.roads("val")
         for frame in frames:
             image = decode(frame.jpeg, ImageLimits())
             target = sample(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
             for horizon in (frame.horizon, None):
                 prepared.append(self.detector.prepare(image, horizon))
-                looks = prepared[-1].looks
-                nearest = min(looks, key=lambda look: abs(look.horizon - frame.horizon))
-                # The detector's order: all looks straight, then all of them mirrored, where left is right.
-                for sign in (1, -1):
-                    for look in looks:
-                        truth["columns"].append(sign * target.columns[::sign])
-                        truth["known"].append(target.known[::sign] * (look is nearest))
-                        truth["presence"].append(np.where(look is nearest, target.presence[::sign], -1.0))
-        return Check(len(frames), tuple(prepared), {name: np.array(values) for name, values in truth.items()})
+                targets.append((target.columns, target.known, target.presence, frame.horizon))
+        names = ("columns", "known", "presence", "horizon")
+        truth = {name: np.array(values) for name, values in zip(names, zip(*targets, strict=True), strict=True)}
+        return Check(len(frames), tuple(prepared), truth)
 
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> RegressorSubject:
         """With a thinner hidden layer."""
@@ -113,11 +104,11 @@ class RegressorSubject:
 
     def calibrated(self, check: Check) -> RegressorSubject:
         """With a temperature and a threshold of presence, where the labels tell presence and absence."""
-        raw = in_batches(lambda part: self.network(contrast(part)), check.inputs)
-        logits, presence = Answer.of(raw).presence.numpy(), check.truth["presence"]
-        told = logits[presence >= 0.0]
-        pairs = np.stack([np.zeros_like(told), told], axis=1)
-        return replace(self, calibration=calibrated(pairs, presence[presence >= 0.0].astype(np.int64)))
+        bare = in_batches(self.under(Calibration()).served(), check.inputs).numpy()
+        presence, truth = self._read(bare, check)[1], check.truth["presence"]
+        told = logit(np.clip(presence[truth >= 0.0], 1e-6, 1.0 - 1e-6))
+        pairs = np.stack([np.zeros_like(told), told], axis=1).astype(np.float32)
+        return self.under(calibrated(pairs, truth[truth >= 0.0].astype(np.int64)))
 
     def under(self, calibration: Calibration) -> RegressorSubject:
         """With a temperature and a threshold."""
@@ -129,12 +120,12 @@ class RegressorSubject:
 
     def figures(self, outputs: NDArray[np.float32], check: Check) -> Figures:
         """Shares of right columns and presences, and mean lateral errors in pixels of a 640 pixel wide image."""
-        columns = outputs[:, :6].reshape(-1, 2, 3) @ at_shares().numpy().T
+        columns, told_presence = self._read(outputs, check)
         error = _WIDE * np.abs(columns - check.truth["columns"])
         labelled = check.truth["known"] >= 1.0
         presence = check.truth["presence"]
         told = presence >= 0.0
-        there = outputs[:, 12:14] >= self.calibration.threshold
+        there = told_presence >= self.calibration.threshold
         return {
             "accuracy": _mean(error[labelled] <= _RIGHT),
             "presence_accuracy": _mean((there == (presence > 0.0))[told]),
@@ -163,6 +154,21 @@ class RegressorSubject:
             metrics=description.metrics,
             exporter=exporter(),
         )
+
+    def _read(self, outputs: NDArray[np.float32], check: Check) -> tuple[FloatArray, FloatArray]:
+        """What the detector reads in outputs: columns (P, 2, S) at `SHARES` of the true depth, presence (P, 2).
+
+        Columns are in image widths from the middle; P counts the prepared frames.
+        """
+        columns, presence = [], []
+        frames = zip(check.prepared, check.by_frame(outputs), check.truth["horizon"], strict=True)
+        for prepared, part, horizon in frames:
+            reading, view = self.detector.read(prepared, part)
+            rows = horizon + np.array(SHARES) * (view.bottom - horizon)
+            x = np.stack([reading.curve(side, view).x(rows) for side in (0, 1)])
+            columns.append((x - (view.width - 1) / 2.0) / view.width)
+            presence.append(reading.presence)
+        return np.array(columns), np.array(presence)
 
 
 def _warps(frame: RoadFrame, rng: np.random.Generator) -> Iterator[Warp]:

@@ -25,7 +25,7 @@ class Check:
     """Frames that prove a file, on their way from JPEG bytes through the detector, and what is true of their inputs.
 
     Of `frames` frames; one that is looked at in different ways is prepared more than once. `truth` has an entry for
-    each row of `inputs`.
+    each row of `inputs`, or for each of `prepared`, as the network's figures need it.
     """
 
     frames: int
