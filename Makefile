@@ -15,13 +15,16 @@ VIDEO ?=
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: demo serve test lint picture clean
+.PHONY: demo serve train-toy test lint picture clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
 
 serve: $(RUN_READY)
 	$(BIN)/lanestream serve
+
+train-toy: $(DEV_READY)
+	$(BIN)/python tools/train_toy.py
 
 test: $(DEV_READY)
 	$(BIN)/python -m pytest

@@ -46,7 +46,9 @@ class Parity:
         return {"validation": self.loss(network, self.batch(1_000_000)).item()}
 
 
-CONFIG = TrainConfig(steps=60, check_every=20, ema=0.9, optimiser=AdamW(learning_rate=0.05), schedule=Cosine(warm_up=5))
+CONFIG = TrainConfig(
+    steps=60, check_every=20, ema=0.9, clip=0.0, optimiser=AdamW(learning_rate=0.05), schedule=Cosine(warm_up=5)
+)
 
 
 def trained(folder: Path, config: TrainConfig = CONFIG, stop_at: int | None = None) -> list[Progress]:
@@ -110,7 +112,7 @@ def test_a_broken_checkpoint_is_named(tmp_path: Path) -> None:
 
 
 def test_a_run_that_blows_up_says_so(tmp_path: Path) -> None:
-    config = TrainConfig(steps=50, optimiser=Sgd(kind="sgd", learning_rate=1e30))
+    config = TrainConfig(steps=50, clip=0.0, optimiser=Sgd(kind="sgd", learning_rate=1e30))
     with pytest.raises(SettingsError, match="lower the learning rate"):
         trained(tmp_path, config)
 

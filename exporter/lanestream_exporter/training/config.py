@@ -59,16 +59,16 @@ class TrainConfig(Section):
     """What every network's run has: how many steps of how many samples, how it learns, what it starts from.
 
     `ema` is the decay per step of the moving average of the weights, 0 for none; `clip` is the largest norm that a
-    gradient keeps, 0 for any. `initial` is the file of weights to
-    start from; its path counts from the folder in which the command runs, as all paths of the file do.
+    gradient keeps, 0 for any. `initial` is the file of weights to start from; its path counts from the folder in which
+    the command runs, as all paths of the file do.
     """
 
     seed: NonNegativeInt = 1
-    steps: PositiveInt = 1900
+    steps: PositiveInt = 1600
     batch: Annotated[int, Field(ge=2)] = 96
-    check_every: PositiveInt = 150
-    ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-    clip: Annotated[float, Field(ge=0.0)] = 0.0
+    check_every: PositiveInt = 200
+    ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.998
+    clip: Annotated[float, Field(ge=0.0)] = 5.0
     initial: str | None = None
     optimiser: Annotated[AdamW | Sgd, Field(discriminator="kind")] = AdamW()
     schedule: Annotated[Cosine | Staircase, Field(discriminator="kind")] = Cosine()
@@ -93,9 +93,9 @@ class PatchData(Section):
     with about `validation_share` of their drives where there are none.
     """
 
-    rendered_scenes: NonNegativeInt = 5000
+    rendered_scenes: NonNegativeInt = 3000
     validation_scenes: PositiveInt = 50
-    real_share: Share = 0.15
+    real_share: Share = 0.25
     final_real_share: Share = 0.5
     train: tuple[Frames, ...] = ()
     validation: tuple[Frames, ...] = ()
