@@ -1,7 +1,16 @@
 """The Lanestream client: frames to a service, lane lines back."""
 
+from lanestream.protocol import CameraModel
 from lanestream_client.async_client import AsyncLaneClient, AsyncLaneStream
 from lanestream_client.client import LaneClient, LaneStream
 from lanestream_client.frames import SourceFrame, StreamResult
 
-__all__ = ["AsyncLaneClient", "AsyncLaneStream", "LaneClient", "LaneStream", "SourceFrame", "StreamResult"]
+__all__ = [
+    "AsyncLaneClient",
+    "AsyncLaneStream",
+    "CameraModel",
+    "LaneClient",
+    "LaneStream",
+    "SourceFrame",
+    "StreamResult",
+]

@@ -14,7 +14,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
-from lanestream.protocol import SUBPROTOCOL, DetectorName, LanesMessage, Mode, ReadyMessage, SummaryMessage
+from lanestream.protocol import SUBPROTOCOL, CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage, SummaryMessage
 from lanestream_client import requests
 from lanestream_client.conversation import Conversation, lost
 from lanestream_client.endpoint import Endpoint
@@ -53,15 +53,20 @@ class AsyncLaneClient:
             return requests.info_of(await self._http.get("/v1/models"), detector)
 
     async def detect(
-        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+        self,
+        image: bytes | str | Path,
+        *,
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> LanesMessage:
         """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height.
 
-        `detector` says what finds them, the service's default where None.
+        `detector` says what finds them, the service's default where None. With a `camera` they are told in metres too.
         """
         data = await asyncio.to_thread(requests.image_bytes, image)
         with requests.reaching(self._endpoint.base):
-            query = requests.parameters(horizon, detector)
+            query = requests.parameters(horizon, detector, camera)
             response = await self._http.post("/v1/detect", content=data, params=query)
         return requests.lanes_of(response)
 
@@ -72,13 +77,14 @@ class AsyncLaneClient:
         mode: Mode = "latest",
         horizon: float | None = None,
         detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> AsyncLaneStream:
         """The lanes of the frames of one camera, in their order, as they come; see LaneClient.stream.
 
         A source that is no async iterable is read in a thread, because it may block.
         """
         source = frames if isinstance(frames, AsyncIterable) else _in_thread(frames)
-        conversation = Conversation(mode, horizon, detector, in_flight=self._in_flight)
+        conversation = Conversation(mode, horizon, detector, camera, in_flight=self._in_flight)
         return AsyncLaneStream(self._endpoint, source, conversation, self._timeout)
 
 

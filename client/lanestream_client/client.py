@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from lanestream.protocol import SUBPROTOCOL, DetectorName, LanesMessage, Mode, ReadyMessage, SummaryMessage
+from lanestream.protocol import SUBPROTOCOL, CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage, SummaryMessage
 from lanestream_client import requests
 from lanestream_client.conversation import Conversation, lost
 from lanestream_client.endpoint import Endpoint
@@ -55,15 +55,20 @@ class LaneClient:
             return requests.info_of(self._http.get("/v1/models"), detector)
 
     def detect(
-        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+        self,
+        image: bytes | str | Path,
+        *,
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> LanesMessage:
         """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height.
 
-        `detector` says what finds them, the service's default where None.
+        `detector` says what finds them, the service's default where None. With a `camera` they are told in metres too.
         """
         data = requests.image_bytes(image)
         with requests.reaching(self._endpoint.base):
-            query = requests.parameters(horizon, detector)
+            query = requests.parameters(horizon, detector, camera)
             return requests.lanes_of(self._http.post("/v1/detect", content=data, params=query))
 
     def stream(
@@ -73,12 +78,13 @@ class LaneClient:
         mode: Mode = "latest",
         horizon: float | None = None,
         detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> LaneStream:
-        """The lanes of the frames of one camera, in their order, as they come; `detector` as for `detect`.
+        """The lanes of the frames of one camera, in their order, as they come; `detector` and `camera` as for `detect`.
 
         A frame that the service refuses gives a result with an `error`, and the stream goes on.
         """
-        conversation = Conversation(mode, horizon, detector, in_flight=self._in_flight)
+        conversation = Conversation(mode, horizon, detector, camera, in_flight=self._in_flight)
         return LaneStream(self._endpoint, as_frames(frames), conversation, self._timeout)
 
 

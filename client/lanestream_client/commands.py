@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lanestream.errors import ImageError, SourceError, needs_extra
+from lanestream.protocol import camera_of
 from lanestream_client.client import LaneClient
 from lanestream_client.frames import SourceFrame
 from lanestream_client.in_process import InProcess, LocalEngine
@@ -63,6 +64,18 @@ def _service_options(command: _Command) -> _Command:
             help="Row of the horizon as a share of the image height  [default: estimated]",
         ),
         click.option(
+            "--camera-height",
+            type=click.FloatRange(0.3, 4.0),
+            metavar="M",
+            help="Metres up to the camera, with --field-of-view: lanes in metres too",
+        ),
+        click.option(
+            "--field-of-view",
+            type=click.FloatRange(20.0, 150.0),
+            metavar="DEG",
+            help="Horizontal field of view of the camera in degrees",
+        ),
+        click.option(
             "--jsonl", type=click.Path(path_type=Path), help="Write one line of JSON a frame; - is the output."
         ),
     ]
@@ -82,16 +95,19 @@ def detect(
     paths: tuple[Path, ...],
     detector: DetectorName | None,
     horizon: float | None,
+    camera_height: float | None,
+    field_of_view: float | None,
     jsonl: Path | None,
     annotate: Path | None,
     **where: Any,
 ) -> None:
     """Find lanes in images: files, or folders of them. Each image stands for itself."""
     files = _files(paths)
+    camera = camera_of(camera_height, field_of_view)
     tally = Tally()
     with ExitStack() as stack:
         service = stack.enter_context(_service(context.obj, **where))
-        lanes_of = partial(service.detect, horizon=horizon, detector=detector)
+        lanes_of = partial(service.detect, horizon=horizon, detector=detector, camera=camera)
         lines = stack.enter_context(json_lines(jsonl))
         advance = stack.enter_context(_progress("images", len(files)))
         for path in files:
@@ -128,6 +144,8 @@ def stream(
     source: str,
     detector: DetectorName | None,
     horizon: float | None,
+    camera_height: float | None,
+    field_of_view: float | None,
     jsonl: Path | None,
     mode: Mode | None,
     video: Path | None,
@@ -138,13 +156,14 @@ def stream(
 
     SOURCE is a video file, a folder of images, a camera number or an rtsp:// or http:// URL.
     """
+    model = camera_of(camera_height, field_of_view)
     with ExitStack() as stack:
         camera = stack.enter_context(open_source(source, fps))
         service = stack.enter_context(_service(context.obj, **where))
         lines = stack.enter_context(json_lines(jsonl))
         outputs = _Outputs(lines, stack.enter_context(video_sink(video, camera.fps)))
         mode = mode or ("latest" if camera.live else "all")
-        follow = partial(service.stream, mode=mode, horizon=horizon, detector=detector)
+        follow = partial(service.stream, mode=mode, horizon=horizon, detector=detector, camera=model)
         interrupted = _follow(follow, camera, outputs, mode)
         click.echo(outputs.tally.report(service.describe(detector), outputs.dropped), err=_is_output(jsonl))
     context.exit(_INTERRUPTED if interrupted else 0)

@@ -19,6 +19,7 @@ from lanestream.errors import (
     error_of,
 )
 from lanestream.protocol import (
+    CameraModel,
     DetectorName,
     EndMessage,
     ErrorMessage,
@@ -52,21 +53,29 @@ class Conversation:
     """
 
     def __init__(
-        self, mode: Mode, horizon: float | None = None, detector: DetectorName | None = None, *, in_flight: int = 1
+        self,
+        mode: Mode,
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
+        *,
+        in_flight: int = 1,
     ) -> None:
         self.ready: ReadyMessage | None = None
         self.summary: SummaryMessage | None = None
-        self._mode = mode
-        self._horizon = horizon
-        self._detector = detector
+        self._asked = {
+            "mode": mode,
+            "horizon": horizon,
+            "detector": detector,
+            "camera": None if camera is None else camera.model_dump(),
+        }
         self._in_flight = in_flight
         self._pending: dict[int, _Pending] = {}
         self._last_seq = -1
 
     def opening(self) -> str:
         """The message that opens the stream. Raises ProtocolError where something was asked for that is none."""
-        asked = {"type": "start", "mode": self._mode, "detector": self._detector, "horizon": self._horizon}
-        return parse_client_message(json.dumps(asked)).model_dump_json(exclude_none=True)
+        return parse_client_message(json.dumps({"type": "start", **self._asked})).model_dump_json(exclude_none=True)
 
     def opened(self, text: str | bytes) -> ReadyMessage:
         """Takes the service's answer to the opening. Raises the error that it tells, ProtocolError where it is odd."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from lanestream.errors import LanestreamError
-from lanestream.protocol import DetectorName, LanesMessage, Mode, SummaryMessage, error_message
+from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, SummaryMessage, error_message
 from lanestream_client.frames import SourceFrame, StreamResult
 from lanestream_client.requests import image_bytes
 from lanestream_client.service import ServiceInfo, as_frames
@@ -46,7 +46,9 @@ class LocalEngine(Protocol):
         """The network of a detector, of the default one where None."""
         ...
 
-    def open_camera(self, horizon: float | None = None, detector: DetectorName | None = None) -> Camera:
+    def open_camera(
+        self, horizon: float | None = None, detector: DetectorName | None = None, camera: CameraModel | None = None
+    ) -> Camera:
         """A session for one camera."""
         ...
 
@@ -63,10 +65,15 @@ class InProcess:
         return ServiceInfo(network.name, network.provider)
 
     def detect(
-        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+        self,
+        image: bytes | str | Path,
+        *,
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> LanesMessage:
         """The lanes of one image file. Raises ImageError, SourceError and NoDetectorError."""
-        return self._engine.open_camera(horizon, detector).lanes(image_bytes(image), seq=0, timestamp=0.0)
+        return self._engine.open_camera(horizon, detector, camera).lanes(image_bytes(image), seq=0, timestamp=0.0)
 
     def stream(
         self,
@@ -75,13 +82,14 @@ class InProcess:
         mode: Mode = "latest",
         horizon: float | None = None,
         detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> LocalStream:
         """The lanes of the frames of one camera. In either mode a frame is taken when the one before is done.
 
         Raises NoDetectorError where `detector` is not loaded.
         """
         del mode  # nothing waits here that a newer frame could replace
-        return LocalStream(self._engine.open_camera(horizon, detector), as_frames(frames))
+        return LocalStream(self._engine.open_camera(horizon, detector, camera), as_frames(frames))
 
 
 class LocalStream:

@@ -19,7 +19,7 @@ from lanestream.errors import (
     SourceError,
     error_of,
 )
-from lanestream.protocol import DetectorName, LanesMessage
+from lanestream.protocol import CameraModel, DetectorName, LanesMessage
 from lanestream_client.service import ServiceInfo
 
 
@@ -33,9 +33,13 @@ def image_bytes(image: bytes | str | Path) -> bytes:
         raise SourceError(f"can't read {image}: {(error.strerror or str(error)).lower()}") from None
 
 
-def parameters(horizon: float | None, detector: DetectorName | None) -> dict[str, float | str]:
+def parameters(
+    horizon: float | None, detector: DetectorName | None, camera: CameraModel | None
+) -> dict[str, float | str]:
     """The query of a request."""
-    given = {"horizon": horizon, "detector": detector}
+    given: dict[str, float | str | None] = {"horizon": horizon, "detector": detector}
+    if camera is not None:
+        given |= {"camera_height": camera.height, "field_of_view": camera.field_of_view}
     return {name: value for name, value in given.items() if value is not None}
 
 

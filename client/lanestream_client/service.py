@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from lanestream.protocol import DetectorName, LanesMessage, Mode, SummaryMessage
+from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, SummaryMessage
 from lanestream_client.frames import SourceFrame, StreamResult
 
 
@@ -38,7 +38,12 @@ class LaneService(Protocol):
         ...
 
     def detect(
-        self, image: bytes | str | Path, *, horizon: float | None = None, detector: DetectorName | None = None
+        self,
+        image: bytes | str | Path,
+        *,
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> LanesMessage:
         """The lanes of one image file."""
         ...
@@ -50,6 +55,7 @@ class LaneService(Protocol):
         mode: Mode = "latest",
         horizon: float | None = None,
         detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
     ) -> ResultStream:
         """The lanes of the frames of one camera."""
         ...

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lanestream.engine import Engine
     from lanestream.inference.providers import Provider
     from lanestream.lanes import Image
-    from lanestream.protocol import DetectorName, LanesMessage
+    from lanestream.protocol import CameraModel, DetectorName, LanesMessage
     from lanestream.sessions import Session
 
 # Who decodes a file of their own may give it more memory than a service gives to strangers.
@@ -42,20 +42,23 @@ class LocalEngine:
         """The network of a detector, of the default one where None. Raises NoDetectorError where it is not loaded."""
         return self._engine.pipeline(detector).network
 
-    def open_camera(self, horizon: float | None = None, detector: DetectorName | None = None) -> LocalCamera:
+    def open_camera(
+        self, horizon: float | None = None, detector: DetectorName | None = None, camera: CameraModel | None = None
+    ) -> LocalCamera:
         """Lanes for the frames of one camera; `horizon` as a share of the image height, estimated where None.
 
-        Raises NoDetectorError where `detector` is not loaded.
+        With a `camera` lanes are told in metres too. Raises NoDetectorError where `detector` is not loaded.
         """
-        return LocalCamera(self._engine, self._engine.open_session(horizon, detector))
+        return LocalCamera(self._engine, self._engine.open_session(horizon, detector), camera)
 
 
 class LocalCamera:
     """One camera's session."""
 
-    def __init__(self, engine: Engine, session: Session) -> None:
+    def __init__(self, engine: Engine, session: Session, model: CameraModel | None) -> None:
         self._engine = engine
         self._session = session
+        self._model = model
 
     def lanes(self, image: bytes | Image, *, seq: int, timestamp: float) -> LanesMessage:
         """The lanes of one frame: an image file, or BGR pixels (H, W, 3) uint8; `timestamp` in seconds.
@@ -68,4 +71,5 @@ class LocalCamera:
         result = self._engine.process(self._session, pixels, timestamp)
         total = 1e3 * (time.perf_counter() - started)
         timing = {"decode": 1e3 * (decoded - started), "queue": 0.0, **result.timing_ms, "total": total}
-        return lanes_message(ProcessedFrame(pixels, replace(result, timing_ms=timing)), seq=seq, timestamp=timestamp)
+        frame = ProcessedFrame(pixels, replace(result, timing_ms=timing))
+        return lanes_message(frame, seq=seq, timestamp=timestamp, camera=self._model)

@@ -17,12 +17,21 @@ SUBPROTOCOL: Final = "lanestream.v1"
 Point = tuple[float, float]
 Mode = Literal["latest", "all"]
 DetectorName = Literal["candidates", "regression"]
+CameraHeight = Annotated[float, Field(ge=0.3, le=4.0, description="Metres from the road up to the camera.")]
+FieldOfView = Annotated[float, Field(ge=20.0, le=150.0, description="Degrees between the image's left and right edge.")]
 
 
 class Message(BaseModel):
     """A JSON object on the wire; a field that nobody knows is an error, so that a typing slip is seen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CameraModel(Message):
+    """What has to be known of a camera to tell lanes in metres: it looks ahead, over a flat road."""
+
+    height: CameraHeight
+    field_of_view: FieldOfView
 
 
 class StartMessage(Message):
@@ -36,6 +45,7 @@ class StartMessage(Message):
     horizon: Annotated[float, Field(gt=0.0, lt=1.0)] | None = Field(
         default=None, description="Row of the horizon as a share of the image height; estimated where absent."
     )
+    camera: CameraModel | None = Field(default=None, description="Lanes are told in metres too where it is given.")
 
 
 class FrameMessage(Message):
@@ -97,6 +107,11 @@ class LaneModel(Message):
     coefficients: tuple[float, float, float]
     covariance: list[list[float]] = Field(description="3 x 3, of the coefficients.")
     age_s: float
+    ground: tuple[float, float, float] | None = Field(
+        default=None,
+        description="[a, b, c] of Y = a X^2 + b X + c on the road, in metres from the camera: X forward, Y left."
+        " Null without a camera.",
+    )
 
     def x(self, y: float) -> float:
         """The boundary's column at row `y`; nearer than one row to the horizon counts as one row."""
@@ -108,12 +123,20 @@ class LaneModel(Message):
 class EgoModel(Message):
     """The lane the camera is in: its boundaries' track ids, and the camera's offset from the centre.
 
-    The offset is a share of the lane width, positive to the right; null unless both boundaries are known.
+    The offset is a share of the lane width, positive to the right; null unless both boundaries are known. The rest is
+    there where the stream has a camera model, and told at the camera: `offset_m` and `lane_width_m` where both
+    boundaries are known, `heading` and `curvature` where one is, as the mean of those known.
     """
 
     left: int | None
     right: int | None
     offset: float | None
+    offset_m: float | None = Field(default=None, description="Metres, positive to the right of the lane's centre.")
+    lane_width_m: float | None = Field(default=None, description="Metres.")
+    heading: float | None = Field(
+        default=None, description="Radians from the vehicle's heading to the lane's, positive to the left."
+    )
+    curvature: float | None = Field(default=None, description="1/m, positive where the lane bends to the left.")
 
 
 class LaneChangeModel(Message):
@@ -197,6 +220,19 @@ def parse_server_message(text: str) -> ReadyMessage | LanesMessage | ErrorMessag
         return _SERVER.validate_json(text)
     except ValidationError as error:
         raise ProtocolError(f"the service sent something unknown: {_first_problem(error)}") from None
+
+
+def camera_of(height: float | None, field_of_view: float | None) -> CameraModel | None:
+    """The camera of two options that go together; None without both. Raises ProtocolError for a half or a bad one."""
+    if height is None and field_of_view is None:
+        return None
+    try:
+        return CameraModel.model_validate({"height": height, "field_of_view": field_of_view})
+    except ValidationError as error:
+        raise ProtocolError(
+            f"not a camera: {_first_problem(error)}",
+            "give both its height, 0.3 to 4 m, and its horizontal field of view, 20 to 150 degrees, or neither",
+        ) from None
 
 
 def error_message(error: BaseException, *, seq: int | None = None, fatal: bool = False) -> ErrorMessage:

@@ -32,7 +32,7 @@ def test_all_fields_are_told() -> None:
     message = told(FrameResult((lane,), EgoLane(5, None), 870.123456789, (LaneChange(5, "left"),)))
     assert (message.seq, message.timestamp, message.width, message.height, message.dropped) == (3, 0.12, 3840, 2160, 2)
     assert (message.horizon, message.timing_ms.total) == (870.12, 1.235)
-    assert message.ego.model_dump() == {"left": 5, "right": None, "offset": None}
+    assert message.ego.model_dump(exclude_none=True) == {"left": 5}
     assert message.events[0].model_dump() == {"type": "lane_change", "track_id": 5, "direction": "left"}
     (lane_told,) = message.lanes
     assert (lane_told.track_id, lane_told.position, lane_told.state) == (5, -1, "predicted")

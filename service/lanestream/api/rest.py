@@ -7,7 +7,7 @@ from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
@@ -17,7 +17,7 @@ from lanestream.api.accept import preferred
 from lanestream.api.service import Service
 from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
 from lanestream.messages import lanes_message
-from lanestream.protocol import DetectorName, LanesMessage, schemas
+from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
 
 if TYPE_CHECKING:
     from lanestream.api.service import Draw
@@ -85,6 +85,16 @@ _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
 }
 
 
+def _camera(
+    camera_height: Annotated[
+        CameraHeight | None, Query(description="Metres up to the camera; lanes in metres.")
+    ] = None,
+    field_of_view: Annotated[FieldOfView | None, Query(description="Its horizontal field of view in degrees.")] = None,
+) -> CameraModel | None:
+    """The camera of a request. Raises ProtocolError for half of one."""
+    return camera_of(camera_height, field_of_view)
+
+
 @router.post(
     "/v1/detect",
     response_model=LanesMessage,
@@ -103,6 +113,7 @@ _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
 )
 async def detect(
     request: Request,
+    camera: Annotated[CameraModel | None, Depends(_camera)],
     horizon: Annotated[
         float | None, Query(gt=0.0, lt=1.0, description="Row of the horizon as a share of the image height.")
     ] = None,
@@ -117,7 +128,7 @@ async def detect(
     with service.sessions.opened(loaded.engine, horizon, detector) as opened:
         data = await _image_bytes(request, service.settings.image_limits)
         frame = await loaded.runner.run(opened.session, data, timestamp=0.0, arrived=time.monotonic())
-    message = lanes_message(frame, seq=0, timestamp=0.0)
+    message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
     if form == _JSON or service.draw is None:
         return Response(message.model_dump_json(), media_type=_JSON)
     picture = await loaded.runner.work(_picture, service.draw, frame, message, form)

@@ -149,7 +149,13 @@ class StreamHandler:
             self._rules.settle(answered=False)
             return error_message(error, seq=frame.seq)
         self._rules.settle(answered=True)
-        return lanes_message(processed, seq=frame.seq, timestamp=frame.timestamp, dropped=self._rules.dropped)
+        return lanes_message(
+            processed,
+            seq=frame.seq,
+            timestamp=frame.timestamp,
+            dropped=self._rules.dropped,
+            camera=self._rules.options.camera,
+        )
 
     def _release(self) -> None:
         if self._opened is None:

@@ -1,0 +1,155 @@
+"""Lanes in metres over real sockets, from every way in. The road of the fakes is straight and its lane is centred."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import fakes
+import httpx
+import pytest
+from websockets.sync.client import connect
+
+from lanestream import cli
+from lanestream.local import LocalEngine
+from lanestream.protocol import LanesMessage
+from lanestream_client import AsyncLaneClient, CameraModel, LaneClient
+from lanestream_client.in_process import InProcess
+
+CAMERA = CameraModel(height=1.4, field_of_view=62.0)
+OPTIONS = ["--camera-height", "1.4", "--field-of-view", "62"]
+
+
+def check_metres(lanes: LanesMessage | dict[str, Any] | None) -> None:
+    """The boundaries of the fakes lean 1.15 columns a row: they are 1.15 camera heights to either side."""
+    assert lanes is not None
+    told = lanes if isinstance(lanes, LanesMessage) else LanesMessage.model_validate(lanes)
+    left, right = (lane.ground for lane in told.lanes)
+    assert left == pytest.approx((0.0, 0.0, 1.61), abs=1e-3)
+    assert right == pytest.approx((0.0, 0.0, -1.61), abs=1e-3)
+    ego = told.ego
+    assert ego.offset_m is not None
+    assert (ego.offset_m, ego.lane_width_m) == pytest.approx((0.0, 3.22), abs=2e-3)
+    assert (ego.heading, ego.curvature) == pytest.approx((0.0, 0.0), abs=1e-4)
+
+
+def detect(url: str, **query: object) -> httpx.Response:
+    return httpx.post(f"{url}/v1/detect", content=fakes.image_file(), params=query)
+
+
+def test_a_stream_with_a_camera_is_told_in_metres(url: str) -> None:
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
+
+        def heard() -> dict[str, Any]:
+            message: dict[str, Any] = json.loads(socket.recv(fakes.WAIT_S))
+            return message
+
+        socket.send(json.dumps({"type": "start", "camera": {"height": 14, "field_of_view": 62}}))
+        refused = heard()
+        assert (refused["code"], refused["fatal"]) == ("bad_message", False)
+        assert "camera.height" in refused["message"]
+        assert "\n" not in refused["message"]
+        socket.send(json.dumps({"type": "start", "mode": "all", "camera": {"height": 1.4, "field_of_view": 62}}))
+        assert heard()["type"] == "ready"
+        for _ in range(2):
+            socket.send(fakes.image_file())
+            check_metres(heard())
+
+
+def test_a_single_image_with_a_camera_is_told_in_metres(url: str) -> None:
+    check_metres(detect(url, camera_height=1.4, field_of_view=62).json())
+    plain = detect(url).json()
+    assert [lane["ground"] for lane in plain["lanes"]] == [None, None]
+    assert [plain["ego"][name] for name in ("offset_m", "lane_width_m", "heading", "curvature")] == [None] * 4
+
+
+@pytest.mark.parametrize("query", [{"camera_height": 1.4}, {"field_of_view": 62}])
+def test_half_a_camera_is_refused(url: str, query: dict[str, float]) -> None:
+    response = detect(url, **query)
+    assert (response.status_code, response.json()["code"]) == (422, "bad_message")
+    missing = "height" if "field_of_view" in query else "field_of_view"
+    assert response.json()["message"].startswith(f"not a camera: {missing}: ")
+    assert response.json()["hint"].startswith("give both its height")
+
+
+@pytest.mark.parametrize(
+    ("height", "angle", "where"),
+    [("0.2", "62", "camera_height"), ("nan", "62", "camera_height"), ("1.4", "180", "field_of_view")],
+)
+def test_a_bad_camera_is_refused(url: str, height: str, angle: str, where: str) -> None:
+    response = detect(url, camera_height=height, field_of_view=angle)
+    assert (response.status_code, response.json()["code"]) == (422, "bad_message")
+    assert where in response.json()["message"]
+    assert "\n" not in response.json()["message"]
+
+
+def test_the_documentation_has_it(url: str) -> None:
+    parameters = httpx.get(f"{url}/openapi.json").json()["paths"]["/v1/detect"]["post"]["parameters"]
+    (height,) = (parameter for parameter in parameters if parameter["name"] == "camera_height")
+    assert not height["required"]
+    assert {"minimum": 0.3, "maximum": 4.0, "type": "number"}.items() <= height["schema"]["anyOf"][0].items()
+    assert "field_of_view" in {parameter["name"] for parameter in parameters}
+
+
+async def test_the_clients_take_a_camera(url: str) -> None:
+    image = fakes.image_file()
+    for client in (LaneClient(url), InProcess(LocalEngine(fakes.engine()))):
+        check_metres(client.detect(image, camera=CAMERA))
+        for result in client.stream([image] * 2, mode="all", camera=CAMERA):
+            check_metres(result.lanes)
+        assert client.detect(image).lanes[0].ground is None
+        if isinstance(client, LaneClient):
+            client.close()
+    async with AsyncLaneClient(url) as waiting:
+        check_metres(await waiting.detect(image, camera=CAMERA))
+        async for result in waiting.stream([image] * 2, mode="all", camera=CAMERA):
+            check_metres(result.lanes)
+
+
+def lanestream(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["lanestream", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    return int(caught.value.code or 0)
+
+
+@pytest.mark.parametrize("remote", [False, True])
+@pytest.mark.parametrize("command", ["detect", "stream"])
+def test_the_commands_take_a_camera(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, url: str, command: str, remote: bool
+) -> None:
+    monkeypatch.setattr(LocalEngine, "load", lambda *_: LocalEngine(fakes.engine()))
+    (tmp_path / "road.jpg").write_bytes(fakes.image_file())
+    where = ["--url", url] if remote else []
+    results = tmp_path / "lanes.jsonl"
+    source = str(tmp_path / "road.jpg")
+    assert lanestream(monkeypatch, command, source, "--jsonl", str(results), *OPTIONS, *where) == 0
+    (line,) = (json.loads(line) for line in results.read_text().splitlines())
+    del line["file"]
+    check_metres(line)
+
+
+@pytest.mark.parametrize("command", ["detect", "stream"])
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (OPTIONS[:2], 1, "error: not a camera: field_of_view: "),
+        (OPTIONS[2:], 1, "error: not a camera: height: "),
+        ([*OPTIONS[:2], "--field-of-view", "nan"], 1, "error: not a camera: field_of_view: "),
+        (["--camera-height", "9", *OPTIONS[2:]], 2, "Usage: "),
+    ],
+)
+def test_the_commands_refuse_a_bad_camera(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    options: list[str],
+    code: int,
+    said: str,
+) -> None:
+    assert lanestream(monkeypatch, command, __file__, *options) == code
+    errors = capsys.readouterr().err
+    assert errors.startswith(said)
+    assert code == 2 or errors.count("\n") == 1
