@@ -34,7 +34,7 @@ PROVENANCE = Provenance({"data": "none", "step": 7}, SOURCE)
 
 def settings(precision: Precision) -> ExportSettings:
     """An untrained network's accuracy is luck: no tolerance for it."""
-    return ExportSettings("tiny", precision, rank_energy=0.9, tolerance=100.0)
+    return ExportSettings("tiny", 0.9, precision, tolerance=100.0)
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def test_the_regressors_small_layers_stay_exact_in_int8(regressor: Exported, tmp
     export.quantized(regressor.path, small, regressor.check.inputs, subject.exact)
     weights = {tensor.name: tensor.data_type for tensor in onnx.load(str(small)).graph.initializer}
     floats = [name for name, kind in weights.items() if kind == onnx.TensorProto.FLOAT and name.endswith("weight")]
-    assert {name.split(".")[1] for name in floats} == {"shape", "doubts"}
+    assert {name.split(".")[1] for name in floats} == {"hidden", "shape", "doubts"}
     info = OnnxModel.load(regressor.path, "cpu").info
     describe(small, info)
     expected = in_batches(subject.served(), regressor.check.inputs).numpy()
@@ -212,7 +212,7 @@ def test_accuracy_beyond_the_tolerance_is_refused(classifier: Exported, lost: di
     good = {"accuracy": 0.912, "average_precision": 0.9}
     fp32, checkpoint = replace(report.fp32, figures=good), replace(report.checkpoint, figures={"accuracy": 0.911})
     passing = replace(report, checkpoint=checkpoint, fp32=fp32, written=replace(report.written, figures=good))
-    told = ExportSettings("x", "int8")
+    told = ExportSettings("x", 0.9, "int8")
     export._refuse(passing, told)
     with pytest.raises(ExportError) as caught:
         export._refuse(replace(passing, written=replace(report.written, figures=lost)), told)

@@ -60,6 +60,7 @@ class ClassifierSubject:
     input_name = "patches"
     output_name = "probabilities"
     exact = ()
+    rank_energy = 0.99
     headline = ("accuracy",)
 
     @property

@@ -34,14 +34,14 @@ _RANGES: Final = 256
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """What to write: its `name`, its `precision`, the share of the hidden layers' `rank_energy` to keep.
+    """What to write: its `name`, the share of the hidden layers' `rank_energy` to keep, its `precision`.
 
     `tolerance` is how many points of accuracy the file may lose against the checkpoint.
     """
 
     name: str
+    rank_energy: float
     precision: Precision = "int8"
-    rank_energy: float = 0.99
     tolerance: float = 0.5
 
 

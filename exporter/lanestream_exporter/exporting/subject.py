@@ -68,6 +68,10 @@ class Subject(Protocol):
         """The layers, by the beginning of their weights' names, that int8 leaves in fp32."""
 
     @property
+    def rank_energy(self) -> float:
+        """The share of the hidden layers' variance that is enough for what the network answers."""
+
+    @property
     def headline(self) -> Sequence[str]:
         """The figures, in shares, of which an export may lose little."""
 
