@@ -136,7 +136,7 @@ def test_the_regressors_small_layers_stay_exact_in_int8(regressor: Exported, tmp
 
 def test_both_files_are_served_by_their_detectors(classifier: Exported, regressor: Exported) -> None:
     for made in (classifier, regressor):
-        engine = load_engine(made.path, "cpu")
+        engine = load_engine(made.path, "cpu", regressor=None)
         prepared = made.check.prepared[0]
         findings = engine.detector.finish(prepared, engine.network.run(prepared.inputs))
         assert findings.view.width == prepared.view.width

@@ -82,6 +82,18 @@ def test_truncation_is_small_and_nearly_exact_on_what_it_saw(layers: nn.Sequenti
 
 
 @torch.inference_mode()
+def test_what_passes_between_thin_layers_is_of_one_size(layers: nn.Sequential) -> None:
+    directions = torch.linalg.qr(torch.randn(300, 8, generator=torch.Generator().manual_seed(5))).Q
+    sizes = torch.tensor([64.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.25, 0.1])
+    x = (torch.randn(256, 8, generator=torch.Generator().manual_seed(6)) * sizes) @ directions.T
+    thin = truncated(layers, x, 0.9999)[0]
+    assert isinstance(thin, nn.Sequential)
+    spread = thin[0](x).std(dim=0)
+    assert len(spread) > 2
+    assert spread.max() < 12.0 * spread.min()  # the components themselves: more than 60
+
+
+@torch.inference_mode()
 def test_truncation_leaves_what_it_would_not_make_smaller(layers: nn.Sequential) -> None:
     x = torch.randn(400, 300, generator=torch.Generator().manual_seed(4))
     for energy in (1.0, 0.999999):

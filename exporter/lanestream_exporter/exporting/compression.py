@@ -46,7 +46,11 @@ def _parts(inputs: NDArray[np.uint8]) -> Iterator[Tensor]:
 
 
 def _factored(layer: nn.Linear, outputs: Tensor, energy: float) -> nn.Module:
-    """Two layers that reproduce `outputs` (N, out) of `layer` in their strongest principal components."""
+    """Two layers that reproduce `outputs` (N, out) of `layer` in their strongest principal components.
+
+    What goes from one to the other is the components mixed by a rotation: alone the first ones would be so much larger
+    than the others that eight bits, which all of them share, could not tell the others from nothing.
+    """
     mean = outputs.mean(dim=0)
     centred = outputs - mean
     # Of N outputs there are at most N components: their Gram matrix is smaller than the layer's covariance.
@@ -56,10 +60,16 @@ def _factored(layer: nn.Linear, outputs: Tensor, energy: float) -> nn.Module:
     rank = min(int(torch.searchsorted(held, energy).item()) + 1, len(values))
     if rank * (layer.in_features + layer.out_features) >= layer.in_features * layer.out_features:
         return layer
-    directions = centred.T @ vectors[:, :rank] / values[:rank].sqrt()
+    directions = centred.T @ vectors[:, :rank] / values[:rank].sqrt() @ _rotation(rank)
     first = nn.Linear(layer.in_features, rank, bias=False)
     second = nn.Linear(rank, layer.out_features)
     first.weight.data = directions.T @ layer.weight
     second.weight.data = directions
     second.bias.data = mean + directions @ (directions.T @ (layer.bias - mean))
     return nn.Sequential(first, second)
+
+
+def _rotation(size: int) -> Tensor:
+    """An orthogonal matrix (size, size), random and always the same."""
+    rotation: Tensor = torch.linalg.qr(torch.randn(size, size, generator=torch.Generator().manual_seed(0))).Q
+    return rotation
