@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import click
 from rich.console import Console
 
-from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
+from lanestream.engine import SHIPPED_MODEL, chosen_regressor, load_engine
 from lanestream.errors import LabelError, ModelError, SourceError, needs_extra
 from lanestream_exporter.datasets.folder import DataFolder
 from lanestream_exporter.datasets.formats import FORMATS
@@ -27,7 +27,6 @@ from lanestream_exporter.evaluation.tables import tables
 if TYPE_CHECKING:
     from lanestream_exporter.datasets.splits import Split
 
-_NONE: Final = Path("none")
 _REGRESSOR: Final = "Regressor that shows classifiers where to look, or `none`.  [default: the shipped one]"
 _NARROWEST: Final = 100  # columns of the tables, also where the terminal has fewer
 
@@ -114,9 +113,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _methods(models: Sequence[Path], regressor: Path | None) -> list[Method]:
-    if regressor is None and SHIPPED_REGRESSOR.is_file():
-        regressor = SHIPPED_REGRESSOR
-    guide = None if regressor == _NONE else regressor
+    guide = chosen_regressor(regressor)
     ours = [Model(load_engine(path, "cpu", guide)) for path in models]
     methods: list[Method] = [*ours, Peer(HoughLinesPeer()), Peer(SlidingWindowPeer())]
     names = [method.name for method in methods]

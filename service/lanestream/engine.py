@@ -24,8 +24,6 @@ from lanestream.sessions import Session
 # The networks that are shipped, and served where no others are named.
 SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
 SHIPPED_REGRESSOR: Final = Path(__file__).parent / "models" / "regressor.onnx"
-# The regressor beside the model where none is named.
-DEFAULT_REGRESSOR: Final[Path | None] = None
 
 
 class Engine:
@@ -76,7 +74,9 @@ class Engine:
         return replace(result, timing_ms=timing)
 
 
-def load_engine(model: Path | None = None, provider: Provider = "auto", regressor: Path | None = None) -> Engine:
+def load_engine(
+    model: Path | None = None, provider: Provider = "auto", regressor: Path | None = SHIPPED_REGRESSOR
+) -> Engine:
     """The engine for the model file at `model`, the shipped classifier where None, warmed up.
 
     A classifier is helped by the `regressor`, which tells it where to look and is a detector of its own; None goes
@@ -103,7 +103,7 @@ def load_engine(model: Path | None = None, provider: Provider = "auto", regresso
 def chosen_regressor(named: Path | None) -> Path | None:
     """The file that users mean by `named`: the default one where they name none, and no file by the name `none`."""
     if named is None:
-        return DEFAULT_REGRESSOR
+        return SHIPPED_REGRESSOR
     return None if named == Path("none") else named
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import onnx
 import pytest
 
-from lanestream.engine import DEFAULT_REGRESSOR, SHIPPED_MODEL, Engine, chosen_regressor, load_engine
+from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, Engine, chosen_regressor, load_engine
 from lanestream.errors import ModelError, NoDetectorError
 from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import CanvasInfo, RegressorInfo
@@ -122,7 +122,7 @@ def test_a_regressor_beside_the_model_is_a_detector_of_its_own(
         assert result.lanes is not None
         assert [lane.position for lane in result.lanes.lanes] == [-1, 1]
         columns = [(lane.points[0][0] - 319.5) / 640 for lane in result.lanes.lanes]
-        assert columns == pytest.approx([-0.4, 0.4], abs=0.01)
+        assert columns == pytest.approx([-0.4, 0.4], abs=0.06)  # moved onto the paint nearby
 
 
 def test_a_regressor_as_the_model_is_the_only_detector(regressor: Path, drive: list[bytes]) -> None:
@@ -140,7 +140,7 @@ def test_a_model_may_go_without_a_regressor(drive: list[bytes], regressor: Path)
         local.detect(drive[0], detector="regression")
     with pytest.raises(ModelError, match=r"is a classifier, not a regressor \(give a regressor, or `none`\)"):
         LocalEngine.load(None, "cpu", SHIPPED_MODEL)
-    assert (chosen_regressor(None), chosen_regressor(Path("none"))) == (DEFAULT_REGRESSOR, None)
+    assert (chosen_regressor(None), chosen_regressor(Path("none"))) == (SHIPPED_REGRESSOR, None)
     assert chosen_regressor(regressor) == regressor
 
 

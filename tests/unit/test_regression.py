@@ -169,7 +169,7 @@ def test_a_plain_warp_takes_an_unknown_horizon_for_the_nearest_look(frame: RoadF
     assert frame.horizon + plain_warp(frame, known=False).assumed * depth == pytest.approx(0.39 * frame.height)
 
 
-def test_without_a_horizon_the_look_counts_that_found_it_where_it_was_taken_to_be() -> None:
+def test_without_a_horizon_the_look_counts_that_the_network_is_surest_of() -> None:
     detector = RegressionDetector()
     prepared = detector.prepare(road())
     assert prepared.inputs.shape == (10, 224, 224, 3)
@@ -177,6 +177,9 @@ def test_without_a_horizon_the_look_counts_that_found_it_where_it_was_taken_to_b
     outputs = both(np.stack([answer(offset) for offset in offsets]))
     assert detector.finish(prepared, outputs).view.horizon == pytest.approx(HORIZON)
     assert abs(detector.read(prepared, outputs)[0].horizon) == pytest.approx(min(abs(o) for o in offsets))
+    outputs[:, 6:12] *= 5.0
+    outputs[[4, 9], 6:12] /= 5.0
+    assert detector.read(prepared, outputs)[0].horizon == pytest.approx(offsets[4])
 
 
 def test_frames_survive_their_file(frame: RoadFrame, tmp_path: Path) -> None:

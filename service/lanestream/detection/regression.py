@@ -54,6 +54,11 @@ class RoadReading:
         return cls(values[:6].reshape(2, 3), values[6:12].reshape(2, 3), values[12:14], float(values[14]))
 
     @property
+    def doubt(self) -> float:
+        """How unsure the network is: its deviations, and a little for a horizon that is not where it was expected."""
+        return float(self.deviations.mean() + 0.05 * abs(self.horizon))
+
+    @property
     def mirrored(self) -> RoadReading:
         """What the reading of a mirrored canvas says of the canvas itself."""
         return RoadReading(-self.columns[::-1], self.deviations[::-1], self.presence[::-1], self.horizon)
@@ -107,13 +112,13 @@ class RegressionDetector:
         return Prepared(image, both, looks[0], looks=looks)
 
     def read(self, prepared: Prepared, outputs: NDArray[np.float32]) -> tuple[RoadReading, RoadView]:
-        """The reading of the look whose horizon was nearest to where the network saw it, and the view with that."""
+        """The reading of the look that the network is surest of, and the view with the horizon that it saw."""
         straight, mirrored = np.split(outputs, 2)
         readings = [
             RoadReading.of(one).mean(RoadReading.of(other).mirrored)
             for one, other in zip(straight, mirrored, strict=True)
         ]
-        best = min(range(len(readings)), key=lambda i: abs(readings[i].horizon))
+        best = min(range(len(readings)), key=lambda i: readings[i].doubt)
         return readings[best], readings[best].view(prepared.looks[best])
 
     def canvas(self, image: Image, view: RoadView) -> NDArray[np.uint8]:
