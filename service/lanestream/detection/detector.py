@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,15 @@ from numpy.typing import NDArray
 from lanestream.detection import Findings, Prepared
 from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
 from lanestream.detection.prior import RoadGlance
-from lanestream.detection.refinement import Refinement
+from lanestream.detection.refinement import USUAL_LEANING, Refinement
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_rows
-from lanestream.lanes import Curve, Detection, FloatArray, Image
+from lanestream.lanes import Candidate, Curve, Detection, FloatArray, Image
 
 TRUE_LANE = 1
+
+# The shares of the depth at which curves are averaged: three tell a curve.
+_ROWS: Final = (1.0, 0.45, 0.15)
 
 
 @dataclass(frozen=True)
@@ -25,8 +29,9 @@ class CandidateDetector:
 
     A candidate is accepted from the probability `threshold` on. A `glance` at the whole road tells where to look;
     without one, edges and ridges alone do. Candidates that are nowhere more than `same` times the rows below the
-    horizon apart follow the same marking. Of two boundaries that come nearer than `separation`, or that cross, one is
-    wrong: the more probable one stays.
+    horizon apart follow the same marking, and those that are nowhere more than `alike` apart, across the line, tell
+    together where it runs. Of two boundaries that come nearer than `separation`, or that cross, one is wrong: the more
+    probable one stays.
     """
 
     threshold: float = 0.5
@@ -35,6 +40,7 @@ class CandidateDetector:
     cutter: StripCutter = StripCutter()
     refinement: Refinement = Refinement()
     same: float = 0.12
+    alike: float = 0.25
     separation: float = 0.8
 
     def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
@@ -49,7 +55,8 @@ class CandidateDetector:
         probability = outputs[:, TRUE_LANE]
         accepted = [int(i) for i in np.argsort(-probability, kind="stable") if probability[i] >= self.threshold]
         chosen = self._different(accepted, prepared)
-        fits = self.refinement.refine(prepared.image, [prepared.candidates[i] for i in chosen], prepared.view)
+        together = [self._together(index, accepted, prepared, probability) for index in chosen]
+        fits = self.refinement.refine(prepared.image, together, prepared.view)
         detections = []
         for index, fit in zip(chosen, fits, strict=True):
             rows = visible_rows(fit.curve, prepared.view, TOP_SHARE)
@@ -67,6 +74,18 @@ class CandidateDetector:
             if all(gap > self.same for gap in gaps):
                 kept.append(index)
         return kept
+
+    def _together(
+        self, index: int, accepted: Sequence[int], prepared: Prepared, probability: NDArray[np.float32]
+    ) -> Candidate:
+        """The mean of a candidate and the accepted ones like it: each errs in its own way, the less sure ones more."""
+        view, best = prepared.view, prepared.candidates[index]
+        rows = view.horizon + np.asarray(_ROWS) * view.depth
+        reach = self.alike * max(1.0, float(np.hypot(1.0, best.curve.slope(rows[1]))) / USUAL_LEANING)
+        alike = [i for i in accepted if np.abs(_gaps(prepared.candidates[i].curve, best.curve, view)).max() <= reach]
+        columns = np.stack([prepared.candidates[i].curve.x(rows) for i in alike])
+        curve = Curve.through(view.horizon, rows, np.average(columns, axis=0, weights=probability[alike] ** 8))
+        return Candidate(curve, *(visible_rows(curve, view, TOP_SHARE) or (best.top, best.bottom)), best.strength)
 
     def _apart(self, detections: Sequence[Detection], view: RoadView) -> list[Detection]:
         """The detections, most probable first, that keep their distance from all better ones."""

@@ -21,7 +21,7 @@ from lanestream.geometry import RoadView, Scaling
 from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis
 
 # hypot(1, slope) of an ego boundary: half a lane of 3.6 m beside a camera 1.45 m high.
-_USUAL_LEANING: Final = 1.6
+USUAL_LEANING: Final = 1.6
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Refinement:
     rows: int = 64
     bars: tuple[float, ...] = (0.05, 0.1, 0.17)
     anchors: tuple[float, float, float] = (1.0, 0.45, 0.15)
-    doubt: tuple[float, float, float] = (0.05, 0.03, 0.04)
+    doubt: tuple[float, float, float] = (0.03, 0.02, 0.015)
     noise: float = 1.0
     blur: float = 0.012
     steps: tuple[float, ...] = (0.06, 0.05, 0.04, 0.03)
@@ -135,4 +135,4 @@ class Refinement:
 def _leaning(candidate: Candidate) -> float:
     """How much wider a candidate's errors are from side to side than those of one that leans as ego boundaries do."""
     slope = float(candidate.curve.slope(0.5 * (candidate.top + candidate.bottom)))
-    return max(1.0, math.hypot(1.0, slope) / _USUAL_LEANING)
+    return max(1.0, math.hypot(1.0, slope) / USUAL_LEANING)
