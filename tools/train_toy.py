@@ -22,7 +22,7 @@ from demo import free_port, stop
 from lanestream_exporter.scenes import render_still, sample_scene
 
 LANESTREAM = Path(sys.executable).with_name("lanestream")
-DRIVES = {"learn": ("monday", "tuesday", "wednesday"), "test": ("thursday",)}
+DRIVES = {"learn": ("monday", "tuesday", "wednesday"), "test": ("thursday", "friday")}
 FRAMES = 8
 
 
@@ -37,7 +37,7 @@ def main(folder: Path) -> None:
     config.write_text(recipe() + f'\n[[data.train]]\npath = "{folder / "learn"}"\n', encoding="utf-8")
     lanestream("data", "check", folder / "learn", "--against", folder / "test", "--sheet", folder / "sheet.jpg")
     lanestream("train", "classifier", config, "--run", run)
-    lanestream("export", run / "best.pt", model, "--precision", "fp32", "--scenes", "8", "--tolerance", "5")
+    lanestream("export", run / "best.pt", model, "--precision", "fp32", "--scenes", "4", "--tolerance", "5")
     report = folder / "evaluation.json"
     lanestream("evaluate", "--model", model, "--regressor", "none", "--data", folder / "test", "--json", report)
     answer = served(model, folder / "test" / "thursday" / "0000.jpg", folder / "service.log")
@@ -79,7 +79,8 @@ def served(model: Path, picture: Path, log_path: Path) -> dict[str, object]:
     port = free_port()
     url = f"http://127.0.0.1:{port}"
     with log_path.open("w") as log:
-        process = subprocess.Popen([LANESTREAM, "serve", "--port", str(port), "--model", model], stdout=log, stderr=log)
+        command = [LANESTREAM, "serve", "--port", str(port), "--model", model, "--regressor", "none"]
+        process = subprocess.Popen(command, stdout=log, stderr=log)
         try:
             await_ready(process, url, log_path)
             answer = httpx.post(f"{url}/v1/detect", content=picture.read_bytes(), timeout=30.0).raise_for_status()
