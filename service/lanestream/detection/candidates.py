@@ -67,7 +67,8 @@ class CandidateSearch:
     `perspective` looks for the road's perspective around a guess, `near_prior` around what a prior says of it. `limit`
     is the most candidates of a frame. Two edges are one marking where their distance is `least_width` to `most_width`
     times the rows below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for double lines).
-    Candidates nearer than `separation` times the rows below the horizon, at two rows, are the same.
+    Candidates nearer than `separation` times the rows below the horizon, at two rows, are the same. Where there is a
+    prior but no known horizon, lines found without the prior count `unguided` times their strength.
     """
 
     hough: ExtendedHough = ExtendedHough()
@@ -80,6 +81,7 @@ class CandidateSearch:
     least_width: float = 0.03
     most_width: float = 0.4
     separation: float = 0.05
+    unguided: float = 0.6
 
     def propose(
         self,
@@ -92,7 +94,8 @@ class CandidateSearch:
 
         `expected` are boundaries that the last frames had. They are candidates before all others: what is still there
         need not be found anew. A `prior` that saw a boundary gives the perspective, candidates of its own, those of
-        the next lanes, and an order for the rest; one that saw none is as good as none.
+        the next lanes, and an order for the rest; one that saw none is as good as none. Of a frame whose horizon is
+        unknown the prior is trusted less: what is found without it is proposed too.
         """
         height, width = image.shape[:2]
         scaling = Scaling(WORKING_WIDTH / width)
@@ -110,7 +113,10 @@ class CandidateSearch:
         known = self._suppress([_known(curve, scaling, view) for curve in expected], [], view)
         if prior is not None and prior.curves:
             lattice = _lattice(prior, scaling, view, point)
-            ranked = sorted((_trusted(line, lattice, view, point) for line in ranked), key=lambda line: -line.strength)
+            ranked = [_trusted(line, lattice, view, point) for line in ranked]
+            if horizon is None:
+                ranked += self._unguided(grey, scaling, view)
+            ranked.sort(key=lambda line: -line.strength)
             seen = [_known(curve, scaling, view) for curve in prior.curves]
             known += self._suppress([*seen, *_neighbours(lattice, view, point)], known, view)
         new = self._suppress(ranked, known, view)
@@ -147,6 +153,21 @@ class CandidateSearch:
         ]
         rays = self._rays(grey, view, point) if "rays" in self.sources else []
         return sorted(_normalised(hough) + _normalised(rays), key=lambda line: -line.strength)
+
+    def _unguided(self, grey: Image, scaling: Scaling, view: RoadView) -> list[_Line]:
+        """What the search finds without its prior, which of a frame of which nothing is known may be wrong.
+
+        The lines keep their own perspective, and count for less than guided ones.
+        """
+        point, lines = self._road(grey, None)
+        own = RoadView(view.width, view.height, point.y)
+        return [
+            replace(
+                _known(scaling.curve_to_image(_curve(line, own, point)), scaling, view),
+                strength=self.unguided * line.strength,
+            )
+            for line in self._ranked(grey, own, point, lines)
+        ]
 
     def _rays(self, grey: Image, view: RoadView, point: Perspective) -> list[_Line]:
         found = self.fan.lines(grey, point)
