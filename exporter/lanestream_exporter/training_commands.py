@@ -85,7 +85,7 @@ def _learn(task: Task, config: TrainConfig, folder: Path) -> None:
     """Trains to the end or to an interruption, and tells how it goes."""
     run = Run(task, config, folder)
     click.echo(f"training on {described(best_device())}" + (f" from step {run.step} on" if run.step else ""))
-    with _interruptible() as stopped, _progress() as bar:
+    with interruptible() as stopped, _progress() as bar:
         shown = bar.add_task("training", total=config.steps, completed=run.step)
 
         def told(learnt: Learnt) -> None:
@@ -104,7 +104,7 @@ def _learn(task: Task, config: TrainConfig, folder: Path) -> None:
 
 
 @contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
+def interruptible() -> Iterator[Callable[[], bool]]:
     """Ctrl-C in the block makes the yielded function true, so that a step is never cut in two; a second one ends it."""
     asked = False
 
