@@ -261,3 +261,7 @@ def test_cuda_is_not_replaced_in_silence(classifier: Exported) -> None:
         OnnxModel.load(classifier.path, "cuda")
     auto = OnnxModel.load(classifier.path, "auto")
     assert (auto.provider, auto.reason) == ("cpu", "the installed onnxruntime has no CUDA")
+
+
+def test_a_file_says_nothing_of_the_machine_it_was_made_on(regressor: Exported) -> None:
+    assert str(Path(torch.__file__).parents[1]).encode() not in regressor.path.read_bytes()

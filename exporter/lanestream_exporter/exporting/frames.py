@@ -54,7 +54,7 @@ class FrameSource:
         """Where the frames come from, for people."""
         if self.own is not None:
             return f"rendered scenes and real frames of {', '.join(frames.path for frames in self.own.train)}"
-        return "rendered scenes" if self.root is None else f"rendered scenes and real frames of {self.root}"
+        return "rendered scenes" if self.root is None else "rendered scenes and the project's real frames"
 
     def jpegs(self, part: Part) -> list[LabelledJpeg]:
         """Whole frames of `part` as JPEG files. Raises LabelError for real frames that can't be read."""

@@ -38,8 +38,11 @@ def write_graph(served: nn.Module, path: Path, input_name: str, output_name: str
 
 
 def describe(path: Path, info: ModelInfo) -> None:
-    """Makes the file at `path` say of itself what `info` says."""
+    """Makes the file at `path` say of itself what `info` says, and nothing of the machine that it was made on."""
     model = onnx.load(str(path))
+    # PyTorch notes the stack of every node, with the paths of the files in it.
+    for part in (model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
+        del part.metadata_props[:]
     onnx.helper.set_model_props(model, {METADATA_KEY: info.model_dump_json()})
     onnx.save(model, str(path))
 
