@@ -215,11 +215,13 @@ def test_a_boundary_that_turns_faster_than_the_filter_believes_is_still_the_same
     tracker = LaneTracker()
     before = drive(tracker, 15, lambda _: road(0.0, (0, 1)))
     sharp = 0.02 * VIEW.depth**2
-    after = tracker.update([detection(b + 0.15 * LANE, sharp) for b in (-1.15, 1.15)], 15 * DT, VIEW)
+    turned = [detection(b + 0.25 * LANE, sharp) for b in (-1.15, 1.15)]
+    first, after = (tracker.update(turned, i * DT, VIEW) for i in (15, 16))
+    assert {lane.state for lane in first.lanes} == {"predicted"}, "a single one out of the gate is an error"
     assert [lane.track_id for lane in after.lanes] == [lane.track_id for lane in before.lanes]
     assert [lane.state for lane in after.lanes] == ["detected", "detected"]
     rows = np.array([330.0, 260.0])
-    expected = Curve(160.0, (319.5, -1.15 + 0.15 * LANE, sharp)).x(rows)
+    expected = Curve(160.0, (319.5, -1.15 + 0.25 * LANE, sharp)).x(rows)
     np.testing.assert_allclose(after.lanes[0].curve.x(rows), expected, atol=3.0)
 
 

@@ -50,24 +50,28 @@ def recover(
     pairs: Sequence[tuple[int, int]],
     reach: FloatArray,
 ) -> list[tuple[int, int]]:
-    """Further (track, detection) pairs of what `pairs` leave over, nearer at the two near rows than `reach` (3,).
+    """(track, detection) pairs of confirmed tracks left out of `pairs`, nearer at the two near rows than `reach` (3,).
 
-    A road that turns faster than the filter believes takes a detection out of its track's gate. Where that is still by
-    far the nearest track there is, it is the same boundary, and the filter was wrong; nearest pairs first.
+    A road that turns faster than the filter believes takes its detections out of the track's gate. Where they are still
+    nearest to that track in the second frame, they are the same boundary, and the filter was wrong; a single one out of
+    the gate is an error. Nearest pairs first. Detections of tentative tracks count as free: it is they that were begun
+    when the detection left the gate.
     """
-    taken = {i for i, _ in pairs}, {j for _, j in pairs}
+    firm = [(i, j) for i, j in pairs if tracks[i].confirmed]
     near = []
     for i, track in enumerate(tracks):
+        if not track.confirmed or track.detected or any(i == other for other, _ in firm):
+            continue
         for j, (columns, _) in enumerate(measured):
             share = float((np.abs(columns - track.columns) / reach)[:2].max())
-            if share < 1.0 and track.confirmed and i not in taken[0] and j not in taken[1]:
+            if share < 1.0:
                 near.append((share, i, j))
-    kept = list(pairs)
+    kept = list(firm)
     for _, i, j in sorted(near):
         free = all(i != other[0] and j != other[1] for other in kept)
         if free and not any(_swaps((i, j), other, tracks, measured) for other in kept):
             kept.append((i, j))
-    return kept[len(pairs) :]
+    return kept[len(firm) :]
 
 
 def _swaps(

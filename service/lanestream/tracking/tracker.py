@@ -28,9 +28,9 @@ class TrackerSettings:
     """
 
     shares: tuple[float, float, float] = (1.0, 0.5, 0.2)
-    acceleration: tuple[float, float, float] = (2.5, 1.6, 1.0)
+    acceleration: tuple[float, float, float] = (1.0, 0.6, 0.4)
     speed: tuple[float, float, float] = (1.0, 0.5, 0.3)
-    noise: float = 0.012
+    noise: float = 0.05
     nod: float = 0.006
     birth: tuple[int, int] = (3, 5)
     coast_s: float = 0.7
@@ -75,7 +75,7 @@ class LaneTracker:
         lost = recover(self._tracks, measured, pairs, self._lane_widths(self._settings.recover, view))
         for i, j in lost:
             self._tracks[i].restart(boundary_filter(*measured[j], self._scaled(self._settings.speed, view)))
-        pairs += lost
+        pairs = [*lost, *(pair for pair in pairs if all(pair[1] != j for _, j in lost))]
         for i, j in pairs:
             self._tracks[i].hit(detections[j], *measured[j], self._clock)
         matched = {i for i, _ in pairs}
