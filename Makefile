@@ -15,7 +15,7 @@ VIDEO ?=
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: demo serve train-toy test lint picture clean
+.PHONY: evaluate proposals demo serve train-toy test lint picture clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -33,6 +33,16 @@ lint: $(DEV_READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+MODELS := service/lanestream/models
+
+evaluate: $(DEV_READY)
+	$(BIN)/lanestream evaluate --split test --model $(MODELS)/classifier.onnx --model $(MODELS)/regressor.onnx \
+	  --out out --json out/evaluation.json
+	$(BIN)/python tools/figures.py out/evaluation.json
+
+proposals: $(DEV_READY)
+	$(BIN)/python tools/proposals.py --split test --json out/proposals.json
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg

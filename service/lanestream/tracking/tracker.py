@@ -28,7 +28,7 @@ class TrackerSettings:
     """
 
     shares: tuple[float, float, float] = (1.0, 0.5, 0.2)
-    acceleration: tuple[float, float, float] = (1.0, 0.6, 0.4)
+    acceleration: tuple[float, float, float] = (2.5, 1.6, 1.0)
     speed: tuple[float, float, float] = (1.0, 0.5, 0.3)
     noise: float = 0.05
     nod: float = 0.006
