@@ -100,24 +100,22 @@ class CandidateSearch:
         height, width = image.shape[:2]
         scaling = Scaling(WORKING_WIDTH / width)
         grey = resized(paint_grey(image), scaling)
-        if prior is not None and prior.curves:
-            guess = _perspective(prior, scaling, grey.shape[0])
-            ridges = find_ridges(grey, guess.y)
-            point = self.near_prior.refine(guess, ridges, grey.shape[1], grey.shape[0] - 1.0, known=True)
-            lines = self._edges_and_lines(grey, point.y)
-        else:
+        guide = prior if prior is not None and prior.curves else None
+        if guide is None:
             point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon))
+        else:
+            point, lines = self._seen_road(grey, guide, scaling)
         view = RoadView(grey.shape[1], grey.shape[0], point.y)
         image_view = RoadView(width, height, scaling.to_image(point.y))
         ranked = self._ranked(grey, view, point, lines)
         known = self._suppress([_known(curve, scaling, view) for curve in expected], [], view)
-        if prior is not None and prior.curves:
-            lattice = _lattice(prior, scaling, view, point)
+        if guide is not None:
+            lattice = _lattice(guide, scaling, view, point)
             ranked = [_trusted(line, lattice, view, point) for line in ranked]
             if horizon is None:
                 ranked += self._unguided(grey, scaling, view)
             ranked.sort(key=lambda line: -line.strength)
-            seen = [_known(curve, scaling, view) for curve in prior.curves]
+            seen = [_known(curve, scaling, view) for curve in guide.curves]
             known += self._suppress([*seen, *_neighbours(lattice, view, point)], known, view)
         new = self._suppress(ranked, known, view)
         found = [
@@ -126,6 +124,13 @@ class CandidateSearch:
         ]
         candidates = [candidate for candidate in found if candidate is not None]
         return Proposals(tuple(candidates[: self.limit]), image_view, point.weight)
+
+    def _seen_road(self, grey: Image, prior: RoadPrior, scaling: Scaling) -> tuple[Perspective, HoughLines]:
+        """The perspective of a prior, moved to where ridges gather, and the Hough lines below its horizon."""
+        height, width = grey.shape
+        guess = _perspective(prior, scaling, height)
+        point = self.near_prior.refine(guess, find_ridges(grey, guess.y), width, height - 1.0, known=True)
+        return point, self._edges_and_lines(grey, point.y)
 
     def _road(self, grey: Image, horizon: float | None) -> tuple[Perspective, HoughLines]:
         """The perspective of the working image and the Hough lines of its road."""
