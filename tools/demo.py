@@ -33,7 +33,7 @@ def main(video: str | None) -> int:
             return code
     name = Path(video).stem
     results, annotated = OUT / f"{name}.lanes.jsonl", OUT / f"{name}.annotated.mp4"
-    with service() as url:
+    with service(OUT / "service.log") as url:
         command = [LANESTREAM, "stream", video, "--url", url, "--mode", "all"]
         code = subprocess.run([*command, "--jsonl", results, "--video", annotated], check=False).returncode
     if code == 0:
@@ -42,14 +42,14 @@ def main(video: str | None) -> int:
 
 
 @contextmanager
-def service() -> Iterator[str]:
-    """A service on a free port, by its URL; its log goes to out/service.log."""
+def service(log_path: Path, *arguments: str | Path) -> Iterator[str]:
+    """A service on a free port, by its URL, started with further `arguments`; its log goes to `log_path`."""
     port = free_port()
     url = f"http://127.0.0.1:{port}"
-    with (OUT / "service.log").open("w") as log:
-        process = subprocess.Popen([LANESTREAM, "serve", "--port", str(port)], stdout=log, stderr=log)
+    with log_path.open("w") as log:
+        process = subprocess.Popen([LANESTREAM, "serve", "--port", str(port), *arguments], stdout=log, stderr=log)
         try:
-            wait_until_ready(process, url)
+            wait_until_ready(process, url, log_path)
             yield url
         finally:
             stop(process)
@@ -64,7 +64,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
         process.kill()
 
 
-def wait_until_ready(process: subprocess.Popen[bytes], url: str) -> None:
+def wait_until_ready(process: subprocess.Popen[bytes], url: str, log_path: Path) -> None:
     """Returns when the network is warm; exits with what the service said where it does not come up."""
     end = time.monotonic() + READY_S
     while time.monotonic() < end and process.poll() is None:
@@ -74,7 +74,7 @@ def wait_until_ready(process: subprocess.Popen[bytes], url: str) -> None:
         except httpx.TransportError:
             pass
         time.sleep(0.1)
-    sys.exit(f"error: the service did not come up:\n{(OUT / 'service.log').read_text()}")
+    sys.exit(f"error: the service did not come up:\n{log_path.read_text()}")
 
 
 def free_port() -> int:

@@ -16,8 +16,11 @@ Groups = Mapping[str, Any]
 @click.argument("path", type=click.Path(path_type=Path), default=Path("out/evaluation.json"))
 def main(path: Path) -> None:
     """Print every table of the model card as Markdown, from PATH."""
-    figures = json.loads(path.read_text(encoding="utf-8"))
-    images, clips = figures["images"], figures["clips"]
+    try:
+        figures = json.loads(path.read_text(encoding="utf-8"))
+        images, clips = figures["images"], figures["clips"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise click.ClickException(f"{path} is not what `lanestream evaluate --json` writes: {error}") from error
     for title, head, rows in (
         ("A. Candidates", _CANDIDATES, _rows(images, _candidates)),
         ("Proposal recall", _PROPOSED, _rows(images, _proposed)),

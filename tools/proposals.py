@@ -14,6 +14,7 @@ from lanestream.detection.candidates import CandidateSearch
 from lanestream.detection.detector import CandidateDetector
 from lanestream.detection.prior import RoadGlance
 from lanestream.engine import load_engine
+from lanestream.errors import LanestreamError
 from lanestream_exporter.datasets.splits import Split, data_root, real_frames
 from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, Proposed, judge
 
@@ -39,7 +40,10 @@ def steps() -> Iterator[tuple[str, CandidateSearch, RoadGlance | None]]:
 @click.option("--json", "path", type=click.Path(path_type=Path), default=Path("out/proposals.json"), show_default=True)
 def main(split: Split, path: Path) -> None:
     """Print the share of labelled boundaries with a true candidate among the first N, by drive and step."""
-    frames = list(real_frames(data_root(), split))
+    try:
+        frames = list(real_frames(data_root(), split))
+    except LanestreamError as error:
+        raise click.ClickException(str(error)) from error
     told: dict[str, dict[str, dict[str, object]]] = {}
     for name, search, glance in steps():
         detector = CandidateDetector(glance=glance, search=search)

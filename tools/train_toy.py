@@ -17,11 +17,10 @@ from pathlib import Path
 import cv2
 import httpx
 import numpy as np
-from demo import free_port, stop
+from demo import LANESTREAM, service
 
 from lanestream_exporter.scenes import render_still, sample_scene
 
-LANESTREAM = Path(sys.executable).with_name("lanestream")
 DRIVES = {"learn": ("monday", "tuesday", "wednesday"), "test": ("thursday", "friday")}
 FRAMES = 8
 
@@ -76,33 +75,10 @@ def lanestream(*arguments: str | Path) -> None:
 
 def served(model: Path, picture: Path, log_path: Path) -> dict[str, object]:
     """What a service of its own answers about a picture."""
-    port = free_port()
-    url = f"http://127.0.0.1:{port}"
-    with log_path.open("w") as log:
-        command = [LANESTREAM, "serve", "--port", str(port), "--model", model, "--regressor", "none"]
-        process = subprocess.Popen(command, stdout=log, stderr=log)
-        try:
-            await_ready(process, url, log_path)
-            answer = httpx.post(f"{url}/v1/detect", content=picture.read_bytes(), timeout=30.0).raise_for_status()
-        finally:
-            stop(process)
+    with service(log_path, "--model", model, "--regressor", "none") as url:
+        answer = httpx.post(f"{url}/v1/detect", content=picture.read_bytes(), timeout=30.0).raise_for_status()
     found: dict[str, object] = answer.json()
     return found
-
-
-def await_ready(process: subprocess.Popen[bytes], url: str, log_path: Path) -> None:
-    """Returns when the network is warm; exits with what the service said where it does not come up."""
-    with httpx.Client(timeout=5.0) as client:
-        for _ in range(600):
-            if process.poll() is not None:
-                break
-            try:
-                if client.get(f"{url}/readyz").is_success:
-                    return
-            except httpx.TransportError:
-                pass
-            time.sleep(0.1)
-    sys.exit(f"error: the service did not come up:\n{log_path.read_text()}")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,6 @@ from labelfiles import (
     tusimple_record,
     write_ccvl,
     write_cvat,
-    write_drive,
     write_lines,
     write_mask,
 )
@@ -40,18 +39,6 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.checking import Check
 from lanestream_exporter.datasets.polylines import sound
 from lanestream_exporter.datasets.reading import Sample, survey
-
-
-@pytest.fixture
-def draw(tmp_path: Path) -> Draw:
-    return drawer(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("rendered")
-    write_drive(folder)
-    return folder
 
 
 def fault_of(path: Path, form: str = "auto") -> str:

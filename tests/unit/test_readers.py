@@ -19,7 +19,6 @@ from labelfiles import (
     Points,
     clip_record,
     cvat_image,
-    drawer,
     labelme,
     painted,
     polyline,
@@ -29,7 +28,6 @@ from labelfiles import (
     tusimple_record,
     write_ccvl,
     write_cvat,
-    write_drive,
     write_lines,
     write_mask,
 )
@@ -38,18 +36,6 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.caltech import bezier
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.reading import read_dataset
-
-
-@pytest.fixture
-def draw(tmp_path: Path) -> Draw:
-    return drawer(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("rendered")
-    write_drive(folder)
-    return folder
 
 
 def points(frame: LabelledFrame) -> list[Points]:
