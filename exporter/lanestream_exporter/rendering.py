@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,9 +16,8 @@ from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import Split, real_frames
 from lanestream_exporter.patches import PatchMaker
 from lanestream_exporter.patchstore import write_store
+from lanestream_exporter.scenefiles import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
-
-SCENES_PER_FILE = 250
 
 _ROUNDS = 5
 
@@ -36,26 +31,7 @@ def rendered_stores(folder: Path, scenes: Sequence[int], workers: int, done: Cal
 
     `done` is called with the number of scenes of each file as it is finished.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"rendered-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
-    missing = [number for number, path in enumerate(paths) if not path.exists()]
-    done(sum(scenes) - sum(scenes[number] for number in missing))
-    # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_leave_interrupts_to_the_parent)
-    try:
-        running = {pool.submit(_render_file, number, scenes[number], paths[number]): number for number in missing}
-        for future in as_completed(running):
-            future.result()
-            done(scenes[running[future]])
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return paths
-
-
-def files_of(scenes: int) -> list[int]:
-    """How `scenes` scenes are shared out among files."""
-    full, rest = divmod(scenes, SCENES_PER_FILE)
-    return [SCENES_PER_FILE] * full + ([rest] if rest else [])
+    return scene_files(folder, "rendered", scenes, _render_file, workers, done)
 
 
 def real_store(folder: Path, root: Path, split: Split) -> Path:
@@ -75,12 +51,7 @@ def labelled_store(path: Path, frames: Iterable[tuple[LabelledFrame, Image]], to
     write_store(path, _labelled_patches(frames, to_train))
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _render_file(number: int, scenes: int, path: Path) -> None:
-    cv2.setNumThreads(1)
     write_store(path, _rendered_patches(number, scenes))
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -19,6 +17,7 @@ from lanestream.geometry import Scaling
 from lanestream.lanes import FloatArray, Image
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 from lanestream_exporter.datasets.splits import Split, real_frames
+from lanestream_exporter.scenefiles import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
@@ -102,17 +101,7 @@ def rendered_frames(folder: Path, scenes: Sequence[int], workers: int, done: Cal
 
     `done` is told how many scenes have become ready.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"frames-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
-    missing = [(number, scenes[number], path) for number, path in enumerate(paths) if not path.exists()]
-    done(sum(scenes) - sum(count for _, count, _ in missing))
-    # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        running = {pool.submit(_render_file, *file): file[1] for file in missing}
-        for future in as_completed(running):
-            future.result()
-            done(running[future])
-    return paths
+    return scene_files(folder, "frames", scenes, _render_file, workers, done)
 
 
 def real_road_frames(root: Path, split: Split) -> list[RoadFrame]:
@@ -177,7 +166,6 @@ def _note(frame: RoadFrame) -> dict[str, object]:
 
 
 def _render_file(number: int, scenes: int, path: Path) -> None:
-    cv2.setNumThreads(1)
     write_frames(path, _rendered(number, scenes))
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from lanestream.inference.providers import cpu_threads
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.rendering import files_of
 from lanestream_exporter.roadframes import read_frames, real_road_frames, rendered_frames, road_frames
+from lanestream_exporter.scenefiles import files_of
 from lanestream_exporter.training.ownframes import own_frames
 from lanestream_exporter.training.regressor import FrameData, FrameSource
 

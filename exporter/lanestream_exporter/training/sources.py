@@ -8,7 +8,8 @@ from typing import Any
 
 from lanestream.inference.providers import cpu_threads
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.rendering import files_of, real_store, rendered_stores
+from lanestream_exporter.rendering import real_store, rendered_stores
+from lanestream_exporter.scenefiles import files_of
 from lanestream_exporter.training.config import PatchData
 from lanestream_exporter.training.ownframes import own_stores
 from lanestream_exporter.training.patchfiles import PatchFiles
