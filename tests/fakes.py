@@ -23,7 +23,9 @@ class FakeDetector:
 
     slopes: tuple[float, ...] = (-1.15, 1.15)
 
-    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
+    def prepare(
+        self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = (), prior: object = None
+    ) -> Prepared:
         height, width = image.shape[:2]
         view = RoadView(width, height, 0.4 * height if horizon is None else horizon)
         return Prepared(image, np.zeros((2, 8, 8, 3), np.uint8), view, (), 1.0)
@@ -52,6 +54,7 @@ class FakeNetwork:
     name = "fake 1"
     provider = "cpu"
     reason = "there is nothing else"
+    buckets = (1, 16)
     metadata: dict[str, Any] = {"kind": "fake"}  # noqa: RUF012
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:

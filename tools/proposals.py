@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from lanestream.detection import answered
 from lanestream.detection.candidates import CandidateSearch
 from lanestream.detection.detector import CandidateDetector
 from lanestream.detection.prior import RoadGlance
@@ -26,13 +27,11 @@ _STRAIGHT = replace(_ALL, perspective=replace(_ALL.perspective, spread_bend=1e-9
 
 def steps() -> Iterator[tuple[str, CandidateSearch, RoadGlance | None]]:
     """The steps, each with what those before it have."""
-    detector = load_engine(provider="cpu").detector
-    assert isinstance(detector, CandidateDetector)  # noqa: S101 - the shipped model is a classifier
     yield "Hough edges", replace(_STRAIGHT, sources=("singles",)), None
     yield "and their pairs", replace(_STRAIGHT, sources=("singles", "pairs")), None
     yield "and the fan", _STRAIGHT, None
     yield "and bends", _ALL, None
-    yield "and the regressor", _ALL, detector.glance
+    yield "and the regressor", _ALL, load_engine(provider="cpu").pipeline().glance
 
 
 @click.command()
@@ -46,10 +45,11 @@ def main(split: Split, path: Path) -> None:
         raise click.ClickException(str(error)) from error
     told: dict[str, dict[str, dict[str, object]]] = {}
     for name, search, glance in steps():
-        detector = CandidateDetector(glance=glance, search=search)
+        detector = CandidateDetector(search=search)
         proposed: dict[str, list[Proposed]] = {}
         for frame, image in frames:
-            prepared = detector.prepare(image)
+            prior = None if glance is None else answered(glance.look(image))
+            prepared = detector.prepare(image, prior=prior)
             nothing = np.zeros((len(prepared.candidates), 2), np.float32)
             proposed.setdefault(frame.group, []).extend(judge(prepared, nothing, prepared, frame).proposed)
         for drive, labels in proposed.items():

@@ -20,6 +20,7 @@ from lanestream.inference.providers import Provider
 from lanestream.lanes import FrameResult, Image
 from lanestream.protocol import DetectorName
 from lanestream.sessions import Session
+from lanestream.sessions.walk import FrameWalk
 
 # The networks that are shipped, and served where no others are named.
 SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
@@ -59,19 +60,15 @@ class Engine:
 
     def process(self, session: Session, image: Image, timestamp: float) -> FrameResult:
         """One frame from image to lanes, in the calling thread, with the milliseconds of each stage."""
-        started = time.perf_counter()
-        prepared = session.prepare(image)
-        proposed = time.perf_counter()
-        outputs = session.network.run(prepared.inputs)
-        inferred = time.perf_counter()
-        result = session.conclude(prepared, outputs, timestamp)
-        tracked = time.perf_counter()
-        timing = {
-            "propose": 1e3 * (proposed - started),
-            "infer": 1e3 * (inferred - proposed),
-            "track": 1e3 * (tracked - inferred),
-        }
-        return replace(result, timing_ms=timing)
+        walk = FrameWalk(session.follow(image, timestamp))
+        question = walk.go()
+        inferring = 0.0
+        while question is not None:
+            started = time.perf_counter()
+            answer = question.network.run(question.inputs)
+            inferring += time.perf_counter() - started
+            question = walk.go(answer)
+        return replace(walk.result, timing_ms={**walk.timing_ms, "infer": 1e3 * inferring})
 
 
 def load_engine(
@@ -87,15 +84,16 @@ def load_engine(
     if isinstance(network.info, RegressorInfo):
         return Engine([Pipeline("regression", _regression(network.info), network)])
     if regressor is None:
-        return Engine([Pipeline("candidates", _candidates(network.info, None), network)])
+        return Engine([Pipeline("candidates", _candidates(network.info), network)])
     other = _warm(regressor, provider)
     if not isinstance(other.info, RegressorInfo):
         raise ModelError(f"{regressor} is a {other.info.kind}, not a regressor", "give a regressor, or `none`")
-    glance = RoadGlance(_regression(other.info), other)
+    regression = _regression(other.info)
+    glance = RoadGlance(regression, other)
     return Engine(
         [
-            Pipeline("candidates", _candidates(network.info, glance), network),
-            Pipeline("regression", glance.detector, other),
+            Pipeline("candidates", _candidates(network.info), network, glance),
+            Pipeline("regression", regression, other),
         ]
     )
 
@@ -113,10 +111,10 @@ def _warm(path: Path, provider: Provider) -> OnnxModel:
     return network
 
 
-def _candidates(info: ClassifierInfo, glance: RoadGlance | None) -> CandidateDetector:
+def _candidates(info: ClassifierInfo) -> CandidateDetector:
     """The detector that asks a classifier about the strips it was trained on."""
     strip = StripGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width, info.strip.lean)
-    return CandidateDetector(info.threshold, glance, cutter=StripCutter(strip))
+    return CandidateDetector(info.threshold, cutter=StripCutter(strip))
 
 
 def _regression(info: RegressorInfo) -> RegressionDetector:

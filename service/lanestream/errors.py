@@ -70,10 +70,64 @@ class OverrunError(LanestreamError):
     code = "overrun"
 
 
+class RateError(LanestreamError):
+    """A client sent more frames or bytes a second than a session may."""
+
+    code = "too_fast"
+
+
+class ExpiredError(LanestreamError):
+    """A frame waited so long that its lanes would be of no use; it was dropped before the networks ran."""
+
+    code = "expired"
+
+
 class BusyError(LanestreamError):
-    """The service is at its session limit."""
+    """The service, or one caller, is at the session limit."""
 
     code = "busy"
+
+
+class DrainingError(LanestreamError):
+    """The service is about to stop and takes nothing new."""
+
+    code = "draining"
+
+
+class UnauthorizedError(LanestreamError):
+    """A caller without a key, or with a wrong one."""
+
+    code = "unauthorized"
+
+
+class ForbiddenError(LanestreamError):
+    """A caller from a web page whose origin is not among the allowed ones."""
+
+    code = "forbidden"
+
+
+class EvictedError(LanestreamError):
+    """The session goes on over another socket, so that this one has to go."""
+
+    code = "evicted"
+
+
+class IdleError(LanestreamError):
+    """Nothing came over a stream for too long."""
+
+    code = "idle"
+
+
+class TooOldError(LanestreamError):
+    """A session reached its longest life."""
+
+    code = "session_too_old"
+
+
+class LostError(LanestreamError):
+    """A frame whose answer was lost with the connection, or with the replica that had it."""
+
+    code = "lost"
 
 
 class NotReadyError(LanestreamError):
@@ -145,7 +199,15 @@ _ANSWERS: Final[dict[str, Answer]] = {
     ProtocolError.code: Answer(422, 1002),
     NoDetectorError.code: Answer(422, 1008),
     OverrunError.code: Answer(429, 1008),
+    RateError.code: Answer(429, 1008),
+    ExpiredError.code: Answer(503, 1013),
     BusyError.code: Answer(503, 1013),
+    DrainingError.code: Answer(503, 1012),
+    UnauthorizedError.code: Answer(401, 1008),
+    ForbiddenError.code: Answer(403, 1008),
+    EvictedError.code: Answer(409, 4001),
+    IdleError.code: Answer(408, 4002),
+    TooOldError.code: Answer(408, 4003),
     NotReadyError.code: Answer(503, 1013),
     NotAcceptableError.code: Answer(406, 1003),
 }

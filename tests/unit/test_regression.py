@@ -10,6 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from lanestream.detection import answered
 from lanestream.detection.prior import RoadGlance
 from lanestream.detection.regression import ANCHORS, OUTPUTS, RegressionDetector, RoadReading
 from lanestream.geometry import CanvasGeometry, RoadView
@@ -52,7 +53,7 @@ def frame() -> RoadFrame:
 class Told:
     """A network that gives the answers it was told, one a call."""
 
-    name, provider, reason = "told", "cpu", "a test"
+    name, provider, reason, buckets = "told", "cpu", "a test", (16,)
     metadata: dict[str, object] = {}  # noqa: RUF012
 
     def __init__(self, *answers: NDArray[np.float32]) -> None:
@@ -108,7 +109,7 @@ def test_the_canvas_keeps_the_horizon_in_its_place_and_the_middle_in_the_middle(
 
 def test_a_horizon_far_off_is_looked_at_again() -> None:
     network = Told(answer(0.2), answer())
-    prior = RoadGlance(RegressionDetector(), network).look(road(), HORIZON - 0.2 * VIEW.depth)
+    prior = answered(RoadGlance(RegressionDetector(), network).look(road(), HORIZON - 0.2 * VIEW.depth))
     assert len(network.seen) == 2
     assert not np.array_equal(network.seen[0], network.seen[1])
     assert prior.left is not None
@@ -116,7 +117,7 @@ def test_a_horizon_far_off_is_looked_at_again() -> None:
 
 
 def test_what_is_not_there_is_no_prior() -> None:
-    prior = RoadGlance(RegressionDetector(), Told(answer(presence=(0.9, 0.1)))).look(road(), HORIZON)
+    prior = answered(RoadGlance(RegressionDetector(), Told(answer(presence=(0.9, 0.1)))).look(road(), HORIZON))
     assert prior.right is None
     assert len(prior.curves) == 1
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol
 
+from lanestream.detection import answered
 from lanestream.detection.detector import CandidateDetector
 from lanestream.engine import Engine
 from lanestream.lanes import FrameResult, Image
@@ -63,17 +64,19 @@ class Model:
         if isinstance(detector, CandidateDetector):
             self._wide = replace(detector, search=replace(detector.search, limit=MOST_CANDIDATES))
             self.threshold = detector.threshold
-            self.guided_by = None if detector.glance is None else detector.glance.network.name
+            glance = engine.pipeline().glance
+            self.guided_by = None if glance is None else glance.network.name
 
     def look(self, image: Image, frame: LabelledFrame) -> Outcome:
         """A single image: the first frame of a new session."""
         session = self._engine.open_session()
-        prepared = session.prepare(image)
+        prepared = answered(session.prepare(image))
         outputs = self._engine.network.run(prepared.inputs)
         found = _found(session.conclude(prepared, outputs, 0.0))
         if self._wide is None:
             return Outcome(frame, found)
-        return Outcome(frame, found, judge(prepared, outputs, self._wide.prepare(image), frame))
+        wide = answered(replace(self._engine.pipeline(), detector=self._wide).prepare(image))
+        return Outcome(frame, found, judge(prepared, outputs, wide, frame))
 
     def follow(self) -> Follower:
         """A session with its tracker."""

@@ -18,6 +18,7 @@ from lanestream.api.service import Service
 from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
 from lanestream.messages import lanes_message
 from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
+from lanestream.sessions.runner import EncodedFrame
 
 if TYPE_CHECKING:
     from lanestream.api.service import Draw
@@ -127,7 +128,7 @@ async def detect(
     form = _answer_form(request, service.draw)
     with service.sessions.opened(loaded.engine, horizon, detector) as opened:
         data = await _image_bytes(request, service.settings.image_limits)
-        frame = await loaded.runner.run(opened.session, data, timestamp=0.0, arrived=time.monotonic())
+        frame = await loaded.runner.run(opened.session, EncodedFrame(data, 0.0, time.monotonic()))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
     if form == _JSON or service.draw is None:
         return Response(message.model_dump_json(), media_type=_JSON)

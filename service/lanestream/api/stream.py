@@ -25,6 +25,7 @@ from lanestream.protocol import (
     error_message,
     parse_client_message,
 )
+from lanestream.sessions.runner import EncodedFrame
 from lanestream.sessions.stream_rules import StreamRules
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ class StreamHandler:
         session = self._ensure_session().session
         try:
             runner = self._service.loaded.runner
-            processed = await runner.run(session, frame.data, frame.timestamp, frame.arrived)
+            processed = await runner.run(session, EncodedFrame(frame.data, frame.timestamp, frame.arrived))
         except Exception as error:
             if not isinstance(error, LanestreamError):
                 _log.exception("frame %d failed", frame.seq)

@@ -1,14 +1,15 @@
 """Finding lane boundaries in one frame.
 
 A detector splits its work in two, so that the network between the halves can be shared by many cameras: `prepare`
-makes network inputs from an image, `finish` makes detections from the network's outputs.
+makes network inputs from an image, `finish` makes detections from the network's outputs. What a frame asks networks is
+told by generators, `Steps`: they yield questions and are sent the answers, and know nothing of batches and threads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,11 @@ from numpy.typing import NDArray
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve, Detection, Image
 from lanestream.protocol import DetectorName
+
+if TYPE_CHECKING:
+    from lanestream.detection.prior import RoadGlance, RoadPrior
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -49,10 +55,16 @@ class Findings:
 class LaneDetector(Protocol):
     """The two halves of a detector. Both are pure and may run in any thread."""
 
-    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
+    def prepare(
+        self,
+        image: Image,
+        horizon: float | None = None,
+        expected: Sequence[Curve] = (),
+        prior: RoadPrior | None = None,
+    ) -> Prepared:
         """Network inputs for a BGR image; `horizon` is its row, give or take a nod of the camera, where it is known.
 
-        `expected` are the boundaries of the frame before, in image pixels.
+        `expected` are the boundaries of the frame before, in image pixels; `prior` is what a glance at the frame told.
         """
         ...
 
@@ -80,6 +92,11 @@ class Network(Protocol):
         ...
 
     @property
+    def buckets(self) -> tuple[int, ...]:
+        """The batch sizes that it runs, smaller ones padded; it is best asked no more at a time than the largest."""
+        ...
+
+    @property
     def metadata(self) -> dict[str, Any]:
         """What the model file says of itself."""
         ...
@@ -90,9 +107,40 @@ class Network(Protocol):
 
 
 @dataclass(frozen=True)
+class Question:
+    """What is asked of a network: inputs (N, H, W, 3) uint8, N may be 0. The answer is its outputs, row by row."""
+
+    network: Network
+    inputs: NDArray[np.uint8]
+
+
+Steps = Generator[Question, NDArray[np.float32], T]
+
+
+def answered(steps: Steps[T]) -> T:
+    """What `steps` come to, each question answered at once in the calling thread."""
+    try:
+        question = next(steps)
+        while True:
+            question = steps.send(question.network.run(question.inputs))
+    except StopIteration as end:
+        value: T = end.value
+        return value
+
+
+@dataclass(frozen=True)
 class Pipeline:
-    """A detector with the network that answers it, by the name that users ask for it."""
+    """A detector with the network that answers it, by the name that users ask for it.
+
+    A `glance` at the whole road, with a network of its own, tells the detector where to look; it can do without.
+    """
 
     name: DetectorName
     detector: LaneDetector
     network: Network
+    glance: RoadGlance | None = None
+
+    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Steps[Prepared]:
+        """The detector's first half, after the glance; arguments as for `LaneDetector.prepare`."""
+        prior = None if self.glance is None else (yield from self.glance.look(image, horizon))
+        return self.detector.prepare(image, horizon, expected, prior)

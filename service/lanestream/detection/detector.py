@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection import Findings, Prepared
 from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
-from lanestream.detection.prior import RoadGlance
+from lanestream.detection.prior import RoadPrior
 from lanestream.detection.refinement import USUAL_LEANING, Refinement
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_rows
@@ -27,15 +27,13 @@ _ROWS: Final = (1.0, 0.45, 0.15)
 class CandidateDetector:
     """Finds boundaries by proposing many and letting the classifier choose.
 
-    A candidate is accepted from the probability `threshold` on. A `glance` at the whole road tells where to look;
-    without one, edges and ridges alone do. Candidates that are nowhere more than `same` times the rows below the
-    horizon apart follow the same marking, and those that are nowhere more than `alike` apart, across the line, tell
-    together where it runs. Of two boundaries that come nearer than `separation`, or that cross, one is wrong: the more
-    probable one stays.
+    A candidate is accepted from the probability `threshold` on. Candidates that are nowhere more than `same` times the
+    rows below the horizon apart follow the same marking, and those that are nowhere more than `alike` apart, across the
+    line, tell together where it runs. Of two boundaries that come nearer than `separation`, or that cross, one is
+    wrong: the more probable one stays.
     """
 
     threshold: float = 0.5
-    glance: RoadGlance | None = None
     search: CandidateSearch = CandidateSearch()
     cutter: StripCutter = StripCutter()
     refinement: Refinement = Refinement()
@@ -43,9 +41,17 @@ class CandidateDetector:
     alike: float = 0.25
     separation: float = 0.8
 
-    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Prepared:
-        """Patches of the candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where known."""
-        prior = None if self.glance is None else self.glance.look(image, horizon)
+    def prepare(
+        self,
+        image: Image,
+        horizon: float | None = None,
+        expected: Sequence[Curve] = (),
+        prior: RoadPrior | None = None,
+    ) -> Prepared:
+        """Patches of the candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where known.
+
+        A `prior` tells where to look; without one, edges and ridges alone do.
+        """
         proposals = self.search.propose(image, horizon, expected, prior)
         patches = self.cutter.cut(image, proposals.candidates, proposals.view)
         return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)

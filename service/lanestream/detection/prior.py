@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from lanestream.detection import Network
+from lanestream.detection import Network, Question, Steps
 from lanestream.detection.regression import RegressionDetector, RoadReading
 from lanestream.geometry import RoadView
 from lanestream.lanes import Curve, Image
@@ -42,11 +42,11 @@ class RoadGlance:
     detector: RegressionDetector
     network: Network
 
-    def look(self, image: Image, horizon: float | None = None) -> RoadPrior:
+    def look(self, image: Image, horizon: float | None = None) -> Steps[RoadPrior]:
         """The prior for a BGR image (H, W, 3); `horizon` is about its row, where known."""
-        reading, seen = self._reading(image, horizon)
+        reading, seen = yield from self._reading(image, horizon)
         if abs(reading.horizon) > _SECOND_LOOK:
-            reading, seen = self._reading(image, seen.horizon)
+            reading, seen = yield from self._reading(image, seen.horizon)
         left, right = (reading.curve(side, seen) if self._is_known(reading, side) else None for side in (0, 1))
         return RoadPrior(seen, left, right)
 
@@ -54,6 +54,6 @@ class RoadGlance:
         is_there = reading.presence[side] >= self.detector.threshold
         return bool(is_there and reading.deviations[side].mean() <= _MOST_DOUBT)
 
-    def _reading(self, image: Image, horizon: float | None) -> tuple[RoadReading, RoadView]:
+    def _reading(self, image: Image, horizon: float | None) -> Steps[tuple[RoadReading, RoadView]]:
         prepared = self.detector.prepare(image, horizon)
-        return self.detector.read(prepared, self.network.run(prepared.inputs))
+        return self.detector.read(prepared, (yield Question(self.network, prepared.inputs)))

@@ -65,6 +65,11 @@ class OnnxModel:
         return f"{self.info.name} {self.info.version}"
 
     @property
+    def buckets(self) -> tuple[int, ...]:
+        """The batch sizes that it runs."""
+        return BUCKETS
+
+    @property
     def metadata(self) -> dict[str, Any]:
         """What the model file says of itself."""
         return self.info.model_dump()

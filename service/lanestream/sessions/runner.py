@@ -1,7 +1,7 @@
 """The way of a frame through the threads, so that the event loop never decodes, proposes, infers or tracks.
 
-A small pool does what OpenCV and numpy do, a glance of the regressor among it; one thread of its own runs the network
-between the halves of a detector, because one network on one device gains nothing from being run twice at a time.
+A small pool does what OpenCV and numpy do; what a frame asks the networks goes to the batcher, where the questions of
+all sessions meet.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
+from lanestream.errors import ExpiredError
 from lanestream.imaging import ImageLimits, decode
+from lanestream.inference.batcher import Batcher, BatchReport
 from lanestream.messages import ProcessedFrame
+from lanestream.sessions.walk import FrameWalk
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from lanestream.detection import Prepared
-    from lanestream.lanes import FrameResult, Image
+    from lanestream.detection import Question
+    from lanestream.lanes import Image
     from lanestream.sessions.session import Session
 
 P = ParamSpec("P")
@@ -29,65 +29,70 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Timed(Generic[T]):
-    """What a step returned, and when it ran, in monotonic seconds."""
+class EncodedFrame:
+    """An image file, when it was captured (the client's seconds) and when it came (monotonic seconds).
 
-    value: T
-    started: float
-    ended: float
+    After `deadline` (monotonic seconds) nobody wants its lanes any more; None: always.
+    """
 
-    @property
-    def ms(self) -> float:
-        """How long the step took."""
-        return 1e3 * (self.ended - self.started)
+    data: bytes
+    timestamp: float
+    arrived: float
+    deadline: float | None = None
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A decoded frame at its first question."""
+
+    image: Image
+    walk: FrameWalk
+    question: Question | None
+    decode_s: float
 
 
 class FrameRunner:
-    """Takes encoded frames to their lanes; the frames of one session one at a time, those of different ones at once."""
+    """Takes encoded frames to their lanes; the frames of one session one at a time, those of different ones at once.
 
-    def __init__(self, limits: ImageLimits, threads: int) -> None:
+    `observe` is told of every batch that the networks run.
+    """
+
+    def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._limits = limits
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
-        self._inference = ThreadPoolExecutor(1, thread_name_prefix="lanestream-inference")
+        self._batcher = Batcher(observe)
 
-    async def run(self, session: Session, data: bytes, timestamp: float, arrived: float) -> ProcessedFrame:
-        """The lanes of the image file in `data`, captured at `timestamp`, come at `arrived` (time.monotonic()).
+    async def run(self, session: Session, frame: EncodedFrame) -> ProcessedFrame:
+        """The lanes of `frame`.
 
-        Raises ImageError where the file is refused; the session is then as it was before.
+        Raises ImageError where the file is refused, ExpiredError where its deadline passes before the networks ran; the
+        session is then as it was before.
         """
-        decoded = await self._timed(self._workers, decode, data, self._limits)
-        prepared = await self._timed(self._workers, session.prepare, decoded.value)
-        outputs = await self._timed(self._inference, session.network.run, prepared.value.inputs)
-        result = await self._timed(self._workers, session.conclude, prepared.value, outputs.value, timestamp)
-        timing = _timing(decoded, prepared, outputs, result, arrived)
-        return ProcessedFrame(decoded.value, replace(result.value, timing_ms=timing))
+        begun = await self.work(self._begin, session, frame)
+        question, inferring = begun.question, 0.0
+        while question is not None:
+            answer = await asyncio.wrap_future(self._batcher.ask(question, frame.deadline))
+            inferring += answer.ended - answer.started
+            question = await self.work(begun.walk.go, answer.outputs)
+        stages = {"decode": 1e3 * begun.decode_s, "infer": 1e3 * inferring, **begun.walk.timing_ms}
+        total = 1e3 * (time.monotonic() - frame.arrived)
+        timing = {**stages, "queue": max(0.0, total - sum(stages.values())), "total": total}
+        return ProcessedFrame(begun.image, replace(begun.walk.result, timing_ms=timing))
 
     async def work(self, step: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """What `step` returns, run in the pool."""
-        return (await self._timed(self._workers, step, *args, **kwargs)).value
+        return await asyncio.get_running_loop().run_in_executor(self._workers, lambda: step(*args, **kwargs))
 
     def close(self) -> None:
         """Ends the threads after what they are at."""
         self._workers.shutdown(cancel_futures=True)
-        self._inference.shutdown(cancel_futures=True)
+        self._batcher.close()
 
-    @staticmethod
-    async def _timed(threads: ThreadPoolExecutor, step: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Timed[T]:
-        def timed() -> Timed[T]:
-            started = time.monotonic()
-            value = step(*args, **kwargs)
-            return Timed(value, started, time.monotonic())
-
-        return await asyncio.get_running_loop().run_in_executor(threads, timed)
-
-
-def _timing(
-    decoded: Timed[Image],
-    prepared: Timed[Prepared],
-    outputs: Timed[NDArray[np.float32]],
-    result: Timed[FrameResult],
-    arrived: float,
-) -> dict[str, float]:
-    stages = {"decode": decoded.ms, "propose": prepared.ms, "infer": outputs.ms, "track": result.ms}
-    total = 1e3 * (result.ended - arrived)
-    return {**stages, "queue": max(0.0, total - sum(stages.values())), "total": total}
+    def _begin(self, session: Session, frame: EncodedFrame) -> _Begun:
+        started = time.monotonic()
+        if frame.deadline is not None and frame.deadline < started:
+            raise ExpiredError("the frame waited too long", "send fewer frames a second")
+        image = decode(frame.data, self._limits)
+        decoded = time.monotonic()
+        walk = FrameWalk(session.follow(image, frame.timestamp))
+        return _Begun(image, walk, walk.go(), decoded - started)

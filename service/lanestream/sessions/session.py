@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Findings, Network, Pipeline, Prepared
+from lanestream.detection import Findings, Network, Pipeline, Prepared, Question, Steps
 from lanestream.lanes import FrameResult, Image
 from lanestream.tracking import LaneTracker
 
@@ -22,7 +22,7 @@ class Session:
     """
 
     def __init__(self, pipeline: Pipeline, horizon: float | None = None) -> None:
-        self._detector = pipeline.detector
+        self._pipeline = pipeline
         self.network: Network = pipeline.network
         self._configured = horizon
         self._estimate: float | None = None
@@ -30,12 +30,21 @@ class Session:
         self._size: tuple[int, int] | None = None
         self._tracker = LaneTracker()
 
-    def prepare(self, image: Image) -> Prepared:
+    def follow(self, image: Image, timestamp: float) -> Steps[FrameResult]:
+        """One frame of the camera, from a BGR image (H, W, 3) uint8 to its lanes; `timestamp` as for `conclude`.
+
+        The session is left as it was until the last answer has come.
+        """
+        prepared = yield from self.prepare(image)
+        outputs = yield Question(self.network, prepared.inputs)
+        return self.conclude(prepared, outputs, timestamp)
+
+    def prepare(self, image: Image) -> Steps[Prepared]:
         """The first half of a frame: network inputs from a BGR image (H, W, 3) uint8. Leaves the session as it is."""
         height = image.shape[0]
         share = self._configured if self._configured is not None else self._estimate
         expected = self._tracker.curves if self._size == (image.shape[1], height) else ()
-        return self._detector.prepare(image, None if share is None else share * height, expected)
+        return self._pipeline.prepare(image, None if share is None else share * height, expected)
 
     def conclude(self, prepared: Prepared, outputs: NDArray[np.float32], timestamp: float) -> FrameResult:
         """The second half: detections from the network's outputs, then one step of the tracker.
@@ -43,7 +52,7 @@ class Session:
         `timestamp` is the capture time in seconds. Frames of a session are concluded one at a time, in order.
         """
         view = prepared.view
-        findings = self._detector.finish(prepared, outputs)
+        findings = self._pipeline.detector.finish(prepared, outputs)
         if self._size not in (None, (view.width, view.height)):
             self._tracker = LaneTracker()
             self._estimate, self._evidence = None, 0.0
