@@ -54,8 +54,9 @@ def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = No
     return app
 
 
-async def _tell(_: Request, error: Exception) -> JSONResponse:
+async def _tell(request: Request, error: Exception) -> JSONResponse:
     told = error_message(error)
+    request.app.state.service.metrics.refused(told.code)
     return _answer(answer_to(error).http_status, told.code, told.message, told.hint)
 
 

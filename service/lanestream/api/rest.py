@@ -14,6 +14,7 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect
 
 from lanestream.api.accept import preferred
+from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.service import Service
 from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
 from lanestream.messages import lanes_message
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from lanestream.detection import Pipeline
     from lanestream.imaging import ImageLimits
     from lanestream.messages import ProcessedFrame
+    from lanestream.sessions.manager import OpenSession
 
 router = APIRouter()
 
@@ -128,7 +130,7 @@ async def detect(
     form = _answer_form(request, service.draw)
     with service.sessions.opened(loaded.engine, horizon, detector) as opened:
         data = await _image_bytes(request, service.settings.image_limits)
-        frame = await loaded.runner.run(opened.session, EncodedFrame(data, 0.0, time.monotonic()))
+        frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic()))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
     if form == _JSON or service.draw is None:
         return Response(message.model_dump_json(), media_type=_JSON)
@@ -160,6 +162,24 @@ async def readyz(request: Request) -> Readiness:
     """Answers once the networks are loaded and warm."""
     networks = [NetworkEntry.of(pipeline) for pipeline in _service(request).loaded.engine.pipelines]
     return Readiness(status="ready", provider=networks[0].provider, networks=networks)
+
+
+@router.get("/metrics", response_class=Response, responses={200: {"content": {MEDIA_TYPE: {}}}})
+async def metrics(request: Request) -> Response:
+    """Counters and histograms in Prometheus' text format."""
+    return Response(_service(request).metrics.exposition(), headers={"content-type": MEDIA_TYPE})
+
+
+async def _processed(service: Service, opened: OpenSession, image: EncodedFrame) -> ProcessedFrame:
+    """The lanes of an image, counted whether they are found or not."""
+    service.metrics.frame_received()
+    try:
+        frame = await service.loaded.runner.run(opened.session, image)
+    except BaseException as error:
+        service.metrics.frame_failed(error)
+        raise
+    service.metrics.frame_processed(frame.result.timing_ms, time.monotonic() - image.arrived)
+    return frame
 
 
 def _service(request: Request) -> Service:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from lanestream.api.metrics import Metrics
 from lanestream.errors import NotReadyError
 from lanestream.protocol import Limits
 from lanestream.sessions.manager import SessionManager
@@ -38,6 +39,7 @@ class Service:
     def __init__(self, settings: Settings, draw: Draw | None = None) -> None:
         self.settings = settings
         self.draw = draw
+        self.metrics = Metrics()
         self.sessions = SessionManager(settings.max_sessions)
         self._loaded: Loaded | None = None
 
@@ -56,7 +58,9 @@ class Service:
 
     def install(self, engine: Engine) -> None:
         """Makes the service ready with a warm engine."""
-        runner = FrameRunner(self.settings.image_limits, self.settings.threads)
+        runner = FrameRunner(self.settings.image_limits, self.settings.threads, self.metrics.batch)
+        for pipeline in engine.pipelines:
+            self.metrics.loaded(pipeline)
         self._loaded = Loaded(engine, runner)
 
     async def close(self) -> None:
