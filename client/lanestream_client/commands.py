@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lanestream.errors import ImageError, SourceError, needs_extra
 from lanestream.protocol import camera_of
+from lanestream.runtime import PROVIDERS
 from lanestream_client.client import LaneClient
 from lanestream_client.frames import SourceFrame
 from lanestream_client.in_process import InProcess, LocalEngine
@@ -50,7 +51,7 @@ def _service_options(command: _Command) -> _Command:
         ),
         click.option(
             "--provider",
-            type=click.Choice(["auto", "cpu", "cuda"]),
+            type=click.Choice(PROVIDERS),
             help="What runs them in this process  [default: auto]",
         ),
         click.option(

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -14,10 +15,11 @@ import click
 
 from lanestream import __version__
 from lanestream.errors import LanestreamError, needs_extra
+from lanestream.runtime import PROVIDERS
 
 if TYPE_CHECKING:
-    from lanestream.inference.providers import Provider
     from lanestream.local import LocalEngine
+    from lanestream.runtime import Provider
 
 _FAILED: Final = 1
 _INTERRUPTED: Final = 130
@@ -95,7 +97,7 @@ def cli(context: click.Context) -> None:
     metavar="FILE|none",
     help="ONNX file of the second network, or none  [default: the shipped one]",
 )
-@click.option("--provider", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the networks run  [default: auto]")
+@click.option("--provider", type=click.Choice(PROVIDERS), help="Where the networks run  [default: auto]")
 @click.option("--max-sessions", type=click.IntRange(1), help="Streams at a time at most  [default: 64]")
 def serve(**given: Any) -> None:
     """Serve lanes over HTTP and WebSockets. Everything can also be set by LANESTREAM_<NAME>."""
@@ -107,7 +109,8 @@ def serve(**given: Any) -> None:
         from lanestream_client.overlays import draw_lanes
     settings = load_settings(**given)
     regressor = chosen_regressor(settings.regressor)
-    run(settings, lambda: load_engine(settings.model, settings.provider, regressor), draw_lanes)
+    load = partial(load_engine, settings.model, settings.provider, regressor, settings.runtime_options)
+    run(settings, load, draw_lanes)
 
 
 def main() -> None:

@@ -15,10 +15,10 @@ from lanestream.detection.regression import RegressionDetector
 from lanestream.detection.strips import StripCutter
 from lanestream.errors import ModelError, NoDetectorError
 from lanestream.geometry import CanvasGeometry, StripGeometry
-from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
-from lanestream.inference.providers import Provider
+from lanestream.inference import ClassifierInfo, LoadedNetwork, RegressorInfo, load_network
 from lanestream.lanes import FrameResult, Image
 from lanestream.protocol import DetectorName
+from lanestream.runtime import DEFAULT_OPTIONS, Provider, RuntimeOptions
 from lanestream.sessions import Session
 from lanestream.sessions.walk import FrameWalk
 
@@ -72,7 +72,10 @@ class Engine:
 
 
 def load_engine(
-    model: Path | None = None, provider: Provider = "auto", regressor: Path | None = SHIPPED_REGRESSOR
+    model: Path | None = None,
+    provider: Provider = "auto",
+    regressor: Path | None = SHIPPED_REGRESSOR,
+    options: RuntimeOptions = DEFAULT_OPTIONS,
 ) -> Engine:
     """The engine for the model file at `model`, the shipped classifier where None, warmed up.
 
@@ -80,12 +83,12 @@ def load_engine(
     without. A regressor as the `model` is the only detector. Raises ModelError for a file that can't be served,
     ProviderError where `provider` can't be had.
     """
-    network = _warm(model or SHIPPED_MODEL, provider)
+    network = _warm(model or SHIPPED_MODEL, provider, options)
     if isinstance(network.info, RegressorInfo):
         return Engine([Pipeline("regression", _regression(network.info), network)])
     if regressor is None:
         return Engine([Pipeline("candidates", _candidates(network.info), network)])
-    other = _warm(regressor, provider)
+    other = _warm(regressor, provider, options)
     if not isinstance(other.info, RegressorInfo):
         raise ModelError(f"{regressor} is a {other.info.kind}, not a regressor", "give a regressor, or `none`")
     regression = _regression(other.info)
@@ -105,8 +108,8 @@ def chosen_regressor(named: Path | None) -> Path | None:
     return None if named == Path("none") else named
 
 
-def _warm(path: Path, provider: Provider) -> OnnxModel:
-    network = OnnxModel.load(path, provider)
+def _warm(path: Path, provider: Provider, options: RuntimeOptions) -> LoadedNetwork:
+    network = load_network(path, provider, options)
     network.warm_up()
     return network
 

@@ -232,6 +232,11 @@ def _kinds(root: type[LanestreamError]) -> Iterator[type[LanestreamError]]:
         yield from _kinds(kind)
 
 
+def one_line(error: BaseException) -> str:
+    """What `error` says, in one line of 200 characters at most."""
+    return " ".join(str(error).split())[:200]
+
+
 @contextmanager
 def needs_extra(extra: str) -> Iterator[None]:
     """Imports in the block need the optional packages `extra`; MissingExtraError says how to get them."""

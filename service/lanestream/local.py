@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from lanestream.detection import Network
     from lanestream.engine import Engine
-    from lanestream.inference.providers import Provider
     from lanestream.lanes import Image
     from lanestream.protocol import CameraModel, DetectorName, LanesMessage
+    from lanestream.runtime import Provider
     from lanestream.sessions import Session
 
 # Who decodes a file of their own may give it more memory than a service gives to strangers.

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from lanestream.errors import SettingsError
 from lanestream.imaging import MOST_PIXELS, ImageLimits
+from lanestream.processors import processors
+from lanestream.runtime import Provider, RuntimeOptions
 
 _PREFIX = "LANESTREAM_"
-
-
-def _processors() -> int:
-    """Processors that this process may use, which in a container are fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Settings(BaseSettings):
@@ -31,15 +27,24 @@ class Settings(BaseSettings):
     regressor: Path | None = Field(
         default=None, description="ONNX file of the second network, or `none`; the shipped one where absent."
     )
-    provider: Literal["auto", "cpu", "cuda"] = Field(default="auto", description="Where the networks run.")
+    provider: Provider = Field(default="auto", description="Where the networks run.")
+    inference_threads: int | None = Field(
+        default=None, ge=1, le=256, description="Threads of one network's run on the CPU; one a processor where absent."
+    )
+    tensorrt_cache: Path | None = Field(default=None, description="Folder where TensorRT keeps the engines it builds.")
     max_bytes: int = Field(default=8 << 20, ge=1024, le=1 << 28, description="Bytes of one image file at most.")
     max_pixels: int = Field(default=4096 * 2304, ge=1 << 16, le=MOST_PIXELS, description="Pixels of one image at most.")
     max_sessions: int = Field(default=64, ge=1, description="Streams and single images at a time at most.")
     credits: int = Field(default=8, ge=1, le=256, description="Unanswered frames of a stream in mode `all` at most.")
     threads: Annotated[int, Field(ge=1, le=256, description="Threads that decode, propose and track.")] = Field(
-        default_factory=_processors
+        default_factory=processors
     )
     opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV takes for one image.")
+
+    @property
+    def runtime_options(self) -> RuntimeOptions:
+        """How the networks run."""
+        return RuntimeOptions(self.inference_threads, self.tensorrt_cache)
 
     @property
     def image_limits(self) -> ImageLimits:

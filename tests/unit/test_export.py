@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from lanestream.engine import load_engine
-from lanestream.errors import ExportError, ModelError, ProviderError
+from lanestream.errors import ExportError, ModelError
 from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
 from lanestream.inference.model_info import METADATA_KEY
 from lanestream_exporter.alexnet import AlexNet, normalise
@@ -254,13 +254,6 @@ def test_wrong_model_files_are_refused_in_one_line(classifier: Exported, tmp_pat
             OnnxModel.load(path, "cpu")
         assert "\n" not in str(caught.value)
         assert caught.value.hint
-
-
-def test_cuda_is_not_replaced_in_silence(classifier: Exported) -> None:
-    with pytest.raises(ProviderError, match="CUDA"):
-        OnnxModel.load(classifier.path, "cuda")
-    auto = OnnxModel.load(classifier.path, "auto")
-    assert (auto.provider, auto.reason) == ("cpu", "the installed onnxruntime has no CUDA")
 
 
 def test_a_file_says_nothing_of_the_machine_it_was_made_on(regressor: Exported) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from lanestream.inference.providers import cpu_threads
+from lanestream.processors import processors
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.roadframes import read_frames, real_road_frames, rendered_frames, road_frames
 from lanestream_exporter.scenefiles import files_of
@@ -30,7 +30,7 @@ def frame_sources(
         sources.append(FrameSource("real", real_road_frames(place, "train"), real_road_frames(place, "val")))
     if data.rendered_scenes:
         scenes = [data.validation_scenes, *files_of(data.rendered_scenes)]
-        paths = rendered_frames(folder, scenes, cpu_threads(), lambda more: done(more, sum(scenes)))
+        paths = rendered_frames(folder, scenes, processors(), lambda more: done(more, sum(scenes)))
         frames = [frame for path in paths[1:] for frame in read_frames(path)]
         sources.append(FrameSource("rendered", frames, read_frames(paths[0])))
     return sources

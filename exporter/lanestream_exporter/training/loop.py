@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from lanestream.errors import SettingsError
-from lanestream.inference.providers import cpu_threads
+from lanestream.processors import processors
 from lanestream_exporter.alexnet import load_state
 from lanestream_exporter.training.average import WeightAverage
 from lanestream_exporter.training.checkpoints import made_by, write_checkpoint
@@ -115,7 +115,7 @@ class Run:
 
     def _batches(self) -> Iterator[Batch]:
         """Batches from the current step on; the next ones are prepared while the network works."""
-        workers = 1 if self._device.type == "cpu" else min(_MOST_WORKERS, cpu_threads())
+        workers = 1 if self._device.type == "cpu" else min(_MOST_WORKERS, processors())
         coming: deque[Future[Batch]] = deque()
         with ThreadPoolExecutor(workers) as pool:
             try:

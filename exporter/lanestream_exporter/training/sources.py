@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lanestream.inference.providers import cpu_threads
+from lanestream.processors import processors
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.rendering import real_store, rendered_stores
 from lanestream_exporter.scenefiles import files_of
@@ -31,7 +31,7 @@ def patch_files(data: PatchData, folder: Path, root: Path | None, done: Callable
     if data.rendered_scenes:
         # The first file validates; scenes of the others are trained on.
         scenes = [data.validation_scenes, *files_of(data.rendered_scenes)]
-        paths = rendered_stores(folder, scenes, cpu_threads(), lambda more: done(more, sum(scenes)))
+        paths = rendered_stores(folder, scenes, processors(), lambda more: done(more, sum(scenes)))
         files.append(PatchFiles("rendered", tuple(paths[1:]), tuple(paths[:1])))
     return files
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -88,6 +89,12 @@ class RegressorInfo(_Description):
 ModelInfo = ClassifierInfo | RegressorInfo
 
 _ADAPTER: Final[TypeAdapter[ModelInfo]] = TypeAdapter(Annotated[ModelInfo, Field(discriminator="kind")])
+
+
+def require_file(path: Path) -> None:
+    """Raises ModelError where there is no file at `path`."""
+    if not path.is_file():
+        raise ModelError(f"no model file at {path}", "give the path of an exported .onnx file")
 
 
 def parse_info(metadata: dict[str, str], source: str) -> ModelInfo:

@@ -2,59 +2,79 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from importlib.util import find_spec
+from typing import Final, Literal
 
 import onnxruntime
 
 from lanestream.errors import ProviderError
+from lanestream.runtime import Provider
 
-Provider = Literal["auto", "cpu", "cuda"]
+# The providers of onnxruntime, and all that a network can be loaded for.
+OnnxProvider = Literal["cpu", "cuda", "tensorrt"]
+Loadable = Literal[OnnxProvider, "openvino"]
 
-_CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+# What onnxruntime calls its providers.
+NAMES: Final[Mapping[OnnxProvider, str]] = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+}
+
+_TITLES: Final[Mapping[OnnxProvider, str]] = {"cpu": "CPU", "cuda": "CUDA", "tensorrt": "TensorRT"}
+
+# What `auto` tries, the best first, and why it takes it. TensorRT builds engines for minutes: it must be asked for.
+_AUTO: Final[Mapping[Loadable, str]] = {
+    "cuda": "CUDA can be used",
+    "openvino": "OpenVINO is installed",
+    "cpu": "onnxruntime on the CPU can always be had",
+}
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The providers to ask for, in order, and why."""
+class Offer:
+    """What the installed packages have: onnxruntime's providers by its names for them, and whether OpenVINO is there.
 
-    names: tuple[str, ...]
-    reason: str
-
-
-def choose(provider: Provider) -> Choice:
-    """What to ask for. Raises ProviderError where CUDA is required and this build of onnxruntime has none.
-
-    A build that lists CUDA may still fail to load it: only the session that was created tells what was got.
+    That a provider is built in does not mean that it can be used: only the loaded network tells what was got.
     """
-    built_in = _CUDA in onnxruntime.get_available_providers()
-    if provider == "cpu":
-        return Choice((_CPU,), "the CPU was asked for")
-    if built_in:
-        onnxruntime.preload_dlls()
-    if provider == "cuda":
-        if not built_in:
+
+    onnxruntime: frozenset[str]
+    openvino: bool
+
+
+def offered() -> Offer:
+    """What is installed here."""
+    return Offer(frozenset(onnxruntime.get_available_providers()), find_spec("openvino") is not None)
+
+
+def attempts(provider: Provider) -> Mapping[Loadable, str]:
+    """The providers to try, in order, each with the reason to take it."""
+    return _AUTO if provider == "auto" else {provider: f"{provider} was asked for"}
+
+
+def require(provider: Loadable, offer: Offer) -> None:
+    """Raises ProviderError where nothing that is installed has `provider`."""
+    if provider == "openvino":
+        if not offer.openvino:
             raise ProviderError(
-                "CUDA was asked for, and the installed onnxruntime has none",
-                "install lanestream[gpu] instead of [cpu], or use the provider auto or cpu",
+                "OpenVINO is not installed", "pip install 'lanestream[openvino]', or use the provider auto or cpu"
             )
-        return Choice((_CUDA,), "CUDA was asked for")
-    if built_in:
-        return Choice((_CUDA, _CPU), "CUDA is tried first")
-    return Choice((_CPU,), "the installed onnxruntime has no CUDA")
-
-
-def cpu_threads() -> int:
-    """How many threads this process may really run at a time."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def verify(provider: Provider, got: list[str]) -> str:
-    """The provider that runs the session, of those it `got`. Raises ProviderError where CUDA was required in vain."""
-    if provider == "cuda" and got[0] != _CUDA:
+    elif NAMES[provider] not in offer.onnxruntime:
         raise ProviderError(
-            f"CUDA was asked for, and onnxruntime fell back to {got[0]}",
-            "check the driver and the CUDA libraries, or use the provider auto",
+            f"the installed onnxruntime has no {_TITLES[provider]}",
+            "install lanestream[gpu] instead of [cpu], or use the provider auto or cpu",
         )
-    return got[0].removesuffix("ExecutionProvider").lower()
+
+
+def verify(provider: OnnxProvider, got: list[str]) -> None:
+    """Raises ProviderError where a session for `provider` came to run on another one of those it `got`.
+
+    onnxruntime falls back in silence, also with its fallback off: only the session itself tells.
+    """
+    if got[0] != NAMES[provider]:
+        raise ProviderError(
+            f"{_TITLES[provider]} can't be used: onnxruntime fell back to {got[0]}",
+            "check the driver and the libraries with `lanestream doctor`, or use the provider auto or cpu",
+        )
