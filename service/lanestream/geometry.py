@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.lanes import Curve, FloatArray
+
+T = TypeVar("T", float, FloatArray)
 
 
 @dataclass(frozen=True)
@@ -21,12 +24,12 @@ class Scaling:
 
     factor: float
 
-    def to_working(self, value: float) -> float:
-        """An image column or row, in working pixels."""
+    def to_working(self, value: T) -> T:
+        """Image columns or rows, in working pixels."""
         return (value + 0.5) * self.factor - 0.5
 
-    def to_image(self, value: float) -> float:
-        """A working column or row, in image pixels."""
+    def to_image(self, value: T) -> T:
+        """Working columns or rows, in image pixels."""
         return (value + 0.5) / self.factor - 0.5
 
     def curve_to_image(self, curve: Curve) -> Curve:
@@ -147,8 +150,9 @@ class StripGeometry:
         across = np.linspace(-1.0, 1.0, self.size, dtype=np.float32)
         slope = float(curve.slope(0.5 * (top + bottom)))
         half_widths = self.half_widths(rows, view, slope).astype(np.float32)
-        columns = curve.x(rows).astype(np.float32)[:, None] + half_widths[:, None] * across
-        return columns, np.broadcast_to(rows.astype(np.float32)[:, None], columns.shape)
+        columns = half_widths[:, None] * across
+        columns += curve.x(rows).astype(np.float32)[:, None]
+        return columns, np.repeat(rows.astype(np.float32)[:, None], self.size, axis=1)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ function x(y) of the image row, because lane boundaries run away from the camera
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -52,7 +53,15 @@ def curve_basis(horizon: float, rows: FloatArray) -> FloatArray:
     return np.stack([np.ones_like(u), u, 1.0 / u], axis=-1)
 
 
-def _depth(horizon: float, y: FloatArray | float) -> FloatArray:
+def curve_columns(curves: Sequence[Curve], rows: FloatArray) -> FloatArray:
+    """Columns (N, R) of N curves at once, at `rows` of their own (N, R) or the same for all (R,)."""
+    horizon, v, b, k = np.array([(curve.horizon, *curve.coefficients) for curve in curves]).reshape(-1, 4).T[:, :, None]
+    u = _depth(horizon, rows)
+    columns: FloatArray = v + b * u + k / u
+    return columns
+
+
+def _depth(horizon: FloatArray | float, y: FloatArray | float) -> FloatArray:
     return np.maximum(np.asarray(y, dtype=float) - horizon, 1.0)
 
 

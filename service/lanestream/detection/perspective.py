@@ -9,6 +9,7 @@ gather at few values of b, so the three are searched for by how sharply they gat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -51,26 +52,32 @@ class RidgePoints:
 
 def find_ridges(grey: Image, horizon: float, width: float = 0.1, limit: int = 1000) -> RidgePoints:
     """The strongest local maxima of a bar filter that is `width` times the depth of each row wide, in a grey image."""
-    height, columns = grey.shape
-    rows = np.unique(np.linspace(horizon + 0.08 * (height - 1 - horizon), height - 1, 112).astype(int))
-    half = np.maximum(np.rint(0.5 * width * (rows - horizon)), 1).astype(int)
-    total = np.pad(np.cumsum(grey[rows].astype(np.float32), axis=1), ((0, 0), (1, 0)))
-    x = np.arange(columns)
-
-    def mean(shift: NDArray[np.int_]) -> NDArray[np.float32]:
-        start = np.clip(x[None, :] + (shift - half)[:, None], 0, columns - 1)
-        stop = np.clip(x[None, :] + (shift + half)[:, None] + 1, 1, columns)
-        area = np.take_along_axis(total, stop, axis=1) - np.take_along_axis(total, start, axis=1)
-        return np.asarray(area / np.maximum(stop - start, 1), dtype=np.float32)
-
-    sides = 2 * half + 1
-    ridge = mean(np.zeros_like(half)) - np.maximum(mean(-sides), mean(sides))
-    contrast = np.clip(ridge / (3.0 * cv2.blur(np.abs(ridge), (161, 5)) + 3.0), 0.0, 1.0)
-    peak = (ridge == cv2.dilate(ridge, np.ones((1, 7), np.uint8))) & (contrast > 0.15)
+    bottom = grey.shape[0] - 1
+    rows = np.unique(np.linspace(horizon + 0.08 * (bottom - horizon), bottom, 112).astype(int))
+    ridge = _bars(grey, rows, np.maximum(np.rint(0.5 * width * (rows - horizon)), 1).astype(int))
+    around = cv2.blur(np.abs(ridge), (161, 5))
+    # A peak from 0.15 of the contrast on; what is not even that need not be divided.
+    peak = (ridge == cv2.dilate(ridge, np.ones((1, 7), np.uint8))) & (ridge > 0.45 * around + 0.45)
     found, at = np.nonzero(peak)
-    weight = contrast[found, at]
-    order = np.argsort(weight, kind="stable")[::-1][:limit]
+    weight = np.minimum(ridge[found, at] / (3.0 * around[found, at] + 3.0), 1.0)
+    order = np.argsort(-weight, kind="stable")[:limit]
     return RidgePoints(at[order].astype(float), rows[found[order]].astype(float), weight[order].astype(float))
+
+
+def _bars(grey: Image, rows: NDArray[np.int_], half: NDArray[np.int_]) -> NDArray[np.float32]:
+    """How much brighter bars of 2 `half` + 1 pixels are than the brighter one of their neighbours, row by row."""
+    columns = grey.shape[1]
+    margin = 3 * int(half.max()) + 2
+    wide = cv2.copyMakeBorder(grey[rows], 0, 0, margin, margin, cv2.BORDER_REPLICATE).astype(np.float32)
+    bars = np.empty((len(rows), columns), np.float32)
+    # Neighbouring rows have bars of the same width: they are filtered together.
+    starts = [0, *(np.flatnonzero(np.diff(half)) + 1).tolist()]
+    for start, stop in pairwise([*starts, len(rows)]):
+        side = 2 * int(half[start]) + 1
+        mean = cv2.blur(wide[start:stop], (side, 1))
+        left, right = (mean[:, at : at + columns] for at in (margin - side, margin + side))
+        bars[start:stop] = mean[:, margin : margin + columns] - np.maximum(left, right)
+    return bars
 
 
 @dataclass(frozen=True)
@@ -99,36 +106,41 @@ class PerspectiveSearch:
         start = np.array([guess.x, guess.y, guess.bend])
         best = start
         for steps, share in ((7, 1.0), (5, 0.3), (5, 0.1)):
-            axes = [np.linspace(-reach, reach, steps) for reach in spread * share]
-            hypotheses = best + np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
-            score = self._gathering(hypotheses, ridges, width, bottom)
-            away = ((hypotheses - start) / spread) ** 2
-            best = hypotheses[int(np.argmax(score - self.prior * score.max() * away.sum(axis=1)))]
+            axes = best[:, None] + np.linspace(-share, share, steps) * spread[:, None]
+            score = self._gathering(axes, ridges, width, bottom)
+            x, y, bend = ((axes - start[:, None]) / spread[:, None]) ** 2
+            away = x[:, None, None] + y[:, None] + bend
+            place = np.unravel_index(int(np.argmax(score - self.prior * score.max() * away)), score.shape)
+            best = axes[np.arange(3), place]
         return replace(guess, x=float(best[0]), y=float(best[1]), bend=float(best[2]))
 
     def _gathering(
-        self, hypotheses: NDArray[np.float64], ridges: RidgePoints, width: int, bottom: float
+        self, axes: NDArray[np.float64], ridges: RidgePoints, width: int, bottom: float
     ) -> NDArray[np.float32]:
-        """How much each hypothesis (N, 3) of (x, y, bend) gathers: the histogram's variance about its smooth self.
+        """How much each hypothesis gathers: the histogram's variance about its smooth self, (N, N, N).
 
-        The histogram is that of where the ridges' boundaries cross the bottom row. Scattered points give the same
-        variance however far a hypothesis draws them together, so that a high horizon has no advantage.
+        `axes` (3, N) are the hypotheses' x, y and bends. The histogram is that of where the ridges' boundaries cross
+        the bottom row. Scattered points give the same variance however far a hypothesis draws them together, so that a
+        high horizon has no advantage.
         """
         # Single precision: a hundredth of a pixel on the bottom row, at half the time.
-        x, y, bend = hypotheses.astype(np.float32).T[:, :, None]
-        depth = np.float32(bottom) - y
-        nearness = depth / np.maximum(ridges.y.astype(np.float32) - y, np.float32(4.0))
-        crossing = x + (ridges.x.astype(np.float32) - x - bend * depth * nearness) * nearness
+        x, y, bend = axes.astype(np.float32)
+        depth = np.float32(bottom) - y[:, None]
+        nearness = depth / np.maximum(ridges.y.astype(np.float32) - y[:, None], np.float32(4.0))
+        # A ridge crosses at x + (x_r - x - bend depth n) n: a part with x, another with the bend.
+        with_x = x[:, None, None] * (np.float32(1.0) - nearness) + ridges.x.astype(np.float32) * nearness
+        with_bend = bend[:, None] * (depth * nearness**2)[:, None]
+        per_cell = np.float32(1.0 / (self.cell * width))
         cells = int(2 * self.reach / self.cell)
+        first = with_x * per_cell + np.float32((self.reach - 0.5) / self.cell + 1.0)
+        crossing = first[:, :, None] - with_bend * per_cell
         # A cell at either end takes what lies beyond.
-        cell = (
-            crossing * np.float32(1.0 / (self.cell * width)) + np.float32((self.reach - 0.5) / self.cell + 1.0)
-        ).astype(np.int32)
-        np.clip(cell, 0, cells + 1, out=cell)
-        cell += np.arange(len(hypotheses), dtype=np.int32)[:, None] * (cells + 2)
+        np.clip(crossing, 0.0, np.float32(cells + 1), out=crossing)
+        cell = crossing.astype(np.int32).reshape(axes.shape[1] ** 3, -1)
+        cell += np.arange(len(cell), dtype=np.int32)[:, None] * (cells + 2)
         weight = np.broadcast_to(ridges.weight, cell.shape)
-        counts = np.bincount(cell.ravel(), weight.ravel(), minlength=len(hypotheses) * (cells + 2))
-        counts = counts.reshape(len(hypotheses), cells + 2)[:, 1:-1].astype(np.float32)
+        counts = np.bincount(cell.ravel(), weight.ravel(), minlength=len(cell) * (cells + 2))
+        counts = counts.reshape(len(cell), cells + 2)[:, 1:-1].astype(np.float32)
         sharp = cv2.blur(counts, (2, 1)) - cv2.blur(counts, (31, 1))
-        gathering: NDArray[np.float32] = (sharp**2).sum(axis=1)
-        return gathering
+        gathering: NDArray[np.float32] = np.einsum("ij,ij->i", sharp, sharp)
+        return gathering.reshape((axes.shape[1],) * 3)

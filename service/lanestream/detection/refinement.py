@@ -7,7 +7,6 @@ straight marking stays straight and a dashed one keeps its direction.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection.edges import paint_grey, resized
 from lanestream.geometry import RoadView, Scaling
-from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis
+from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis, curve_columns
 
 # hypot(1, slope) of an ego boundary: half a lane of 3.6 m beside a camera 1.45 m high.
 USUAL_LEANING: Final = 1.6
@@ -58,81 +57,96 @@ class Refinement:
         """A fit for each candidate of a BGR image (H, W, 3)."""
         if not candidates:
             return []
-        scaling = Scaling(min(1.0, self.detail_width / view.width))
-        grey = paint_grey(resized(image, scaling))
-        leanings = [_leaning(candidate) for candidate in candidates]
-        strips = self._strips(grey, candidates, leanings, view, scaling)
-        return [
-            self._fit(candidate, leaning, strip, view)
-            for candidate, leaning, strip in zip(candidates, leanings, strips, strict=True)
-        ]
+        along = _Along.of(candidates, view, self.rows)
+        strips = self._strips(image, along, view)
+        bars = [self._bars(strip, leaning) for strip, leaning in zip(strips, along.leaning, strict=True)]
+        return self._fits(along, np.stack(bars), view)
 
-    def _strips(
-        self,
-        grey: Image,
-        candidates: Sequence[Candidate],
-        leanings: Sequence[float],
-        view: RoadView,
-        scaling: Scaling,
-    ) -> list[NDArray[np.float32]]:
-        """Bar contrast (rows, cells), 0 to 1, of the strip along each candidate."""
-        across = np.linspace(-self.reach, self.reach, self.cells)
-        columns, rows = [], []
-        for candidate, leaning in zip(candidates, leanings, strict=True):
-            y = np.linspace(candidate.top, candidate.bottom, self.rows)
-            x = candidate.curve.x(y)[:, None] + (y - view.horizon)[:, None] * leaning * across[None, :]
-            columns.append(scaling.to_working(0.0) + x * scaling.factor)
-            rows.append(np.broadcast_to((scaling.to_working(0.0) + y * scaling.factor)[:, None], x.shape))
+    def _strips(self, image: Image, along: _Along, view: RoadView) -> NDArray[np.float32]:
+        """Grey levels (N, rows, cells) of the strip along each candidate."""
+        scaling = Scaling(min(1.0, self.detail_width / view.width))
+        reach = (along.below * along.leaning[:, None] * scaling.factor).astype(np.float32)
+        columns = scaling.to_working(along.x).astype(np.float32)[:, :, None] + reach[:, :, None] * self._across()
+        rows = np.broadcast_to(scaling.to_working(along.y).astype(np.float32)[:, :, None], columns.shape)
         warped = cv2.remap(
-            grey,
-            np.concatenate(columns).astype(np.float32),
-            np.concatenate(rows).astype(np.float32),
+            resized(image, scaling),
+            columns.reshape(-1, self.cells),
+            rows.reshape(-1, self.cells),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        strips = warped.astype(np.float32).reshape(len(candidates), self.rows, self.cells)
-        return [self._bars(strip, leaning) for strip, leaning in zip(strips, leanings, strict=True)]
+        return paint_grey(np.asarray(warped, np.uint8)).astype(np.float32).reshape(columns.shape)
 
-    def _bars(self, warped: NDArray[np.float32], leaning: float) -> NDArray[np.float32]:
-        contrast = np.max([self._contrast(warped, bar / leaning) for bar in self.bars], axis=0)
+    def _across(self) -> NDArray[np.float32]:
+        """Where a strip's cells (cells,) are beside its candidate, in rows below the horizon times its leaning."""
+        return np.linspace(-self.reach, self.reach, self.cells, dtype=np.float32)
+
+    def _bars(self, strip: NDArray[np.float32], leaning: float) -> NDArray[np.float32]:
+        """Bar contrast (rows, cells), 0 to 1, of a strip."""
+        contrast = self._contrast(strip, self.bars[0] / leaning)
+        for bar in self.bars[1:]:
+            np.maximum(contrast, self._contrast(strip, bar / leaning), out=contrast)
         # Five grey levels above its own row's unrest is a bar that an eye would see.
         unrest = np.abs(contrast).mean(axis=1, keepdims=True)
         return np.asarray(np.clip((contrast - unrest) / (unrest + 5.0), 0.0, 1.0), dtype=np.float32)
 
-    def _contrast(self, warped: NDArray[np.float32], bar: float) -> NDArray[np.float32]:
+    def _contrast(self, strip: NDArray[np.float32], bar: float) -> NDArray[np.float32]:
         """How much brighter a bar is than the brighter one of its neighbours of the same width."""
         width = max(1, round(bar / (2 * self.reach) * self.cells)) | 1
-        mean = cv2.blur(warped, (width, 1))
-        sides = np.pad(mean, ((0, 0), (width, width)), mode="edge")
+        mean = cv2.blur(strip, (width, 1))
+        sides = cv2.copyMakeBorder(mean, 0, 0, width, width, cv2.BORDER_REPLICATE)
         return np.asarray(mean - np.maximum(sides[:, : -2 * width], sides[:, 2 * width :]), dtype=np.float32)
 
-    def _fit(self, candidate: Candidate, leaning: float, strip: NDArray[np.float32], view: RoadView) -> Fit:
-        """Columns at the anchor rows by least squares with the candidate as the prior."""
-        y = np.linspace(candidate.top, candidate.bottom, self.rows)
-        below = y - view.horizon
-        across = leaning * np.linspace(-self.reach, self.reach, self.cells)
+    def _fits(self, along: _Along, bars: NDArray[np.float32], view: RoadView) -> list[Fit]:
+        """Columns at the anchor rows by least squares with the candidates as the prior."""
         anchors = view.horizon + np.asarray(self.anchors) * view.depth
         to_curve = np.linalg.inv(curve_basis(view.horizon, anchors))
-        basis = curve_basis(view.horizon, y) @ to_curve
-        sigma = self.noise * view.width / 640.0 + self.blur * below
-        prior = np.diag(1.0 / (leaning * np.asarray(self.doubt) * view.depth) ** 2)
-        shift, normal = np.zeros(3), prior
+        basis = curve_basis(view.horizon, along.y) @ to_curve
+        leaning = along.leaning[:, None]
+        sigma = self.noise * view.width / 640.0 + self.blur * along.below
+        prior = np.eye(3) / (leaning * np.asarray(self.doubt) * view.depth)[:, None] ** 2
+        # Sums over a strip's cells, and sums of where they are, in one product.
+        across = self._across()
+        sums = np.stack([np.ones_like(across), across], axis=1)
+        shift, normal = np.zeros((len(bars), 3)), prior
         for reach in self.steps:
-            off = across[None, :] - (basis @ shift / below)[:, None]
-            weight = strip / (1.0 + (off / (leaning * reach)) ** 2) ** 2
-            total = weight.sum(axis=1)
-            centre = (weight * across[None, :]).sum(axis=1) / np.maximum(total, 1e-6) * below
+            seen = (basis @ shift[:, :, None])[:, :, 0] / (along.below * leaning)
+            off = (across - seen.astype(np.float32)[:, :, None]) * np.float32(1.0 / reach)
+            total, moment = np.moveaxis((bars / (1.0 + off * off) ** 2) @ sums, 2, 0).astype(np.float64)
+            centre = moment / np.maximum(total, 1e-6) * along.below * leaning
             # A row counts once, however wide its bar; a row without a bar does not count.
-            trust = np.minimum(total / 2.0, 1.0) / sigma**2
-            normal = prior + basis.T @ (basis * trust[:, None])
-            shift = np.linalg.solve(normal, basis.T @ (trust * centre))
-        columns = candidate.curve.x(anchors) + shift
+            trusted = basis.swapaxes(1, 2) * (np.minimum(total / 2.0, 1.0) / sigma**2)[:, None]
+            normal = prior + trusted @ basis
+            shift = np.linalg.solve(normal, trusted @ centre[:, :, None])[:, :, 0]
+        coefficients = (curve_columns(along.curves, anchors) + shift) @ to_curve.T
         # Neighbouring rows share their errors: about four of them are worth one.
-        covariance = to_curve @ np.linalg.inv(prior + (normal - prior) / 4.0) @ to_curve.T
-        return Fit(Curve.through(view.horizon, anchors, columns), covariance)
+        covariances = to_curve @ np.linalg.inv(prior + (normal - prior) / 4.0) @ to_curve.T
+        return [
+            Fit(Curve(view.horizon, (v, b, k)), covariance)
+            for (v, b, k), covariance in zip(coefficients.tolist(), covariances, strict=True)
+        ]
 
 
-def _leaning(candidate: Candidate) -> float:
-    """How much wider a candidate's errors are from side to side than those of one that leans as ego boundaries do."""
-    slope = float(candidate.curve.slope(0.5 * (candidate.top + candidate.bottom)))
-    return max(1.0, math.hypot(1.0, slope) / USUAL_LEANING)
+@dataclass(frozen=True)
+class _Along:
+    """The rows (N, R) `y` along `curves`, the curves' columns `x` there, how far `below` the horizon they are.
+
+    `leaning` (N,) is how much wider a candidate's errors are from side to side than those of one that leans as ego
+    boundaries do.
+    """
+
+    curves: tuple[Curve, ...]
+    y: FloatArray
+    x: FloatArray
+    below: FloatArray
+    leaning: FloatArray
+
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate], view: RoadView, rows: int) -> _Along:
+        """`rows` rows along each candidate."""
+        curves = tuple(candidate.curve for candidate in candidates)
+        top, bottom = np.array([(candidate.top, candidate.bottom) for candidate in candidates]).T
+        y = np.linspace(top, bottom, rows, axis=1)
+        slope = [float(curve.slope(middle)) for curve, middle in zip(curves, 0.5 * (top + bottom), strict=True)]
+        leaning = np.maximum(1.0, np.hypot(1.0, slope) / USUAL_LEANING)
+        return cls(curves, y, curve_columns(curves, y), y - view.horizon, leaning)

@@ -32,13 +32,13 @@ class StripCutter:
         scaling = Scaling(min(1.0, self.detail_width / view.width))
         detail = resized(image, scaling)
         detail_view = view.scaled(scaling, detail.shape[1], detail.shape[0])
-        grids = [self._grid(candidate, detail_view, scaling) for candidate in candidates]
-        columns = np.concatenate([grid[0] for grid in grids])
-        rows = np.concatenate([grid[1] for grid in grids])
-        # The border is mirrored: black would tell the network where the image ends, which no road does.
-        patches = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-        rgb = cv2.cvtColor(patches, cv2.COLOR_BGR2RGB)
-        return np.asarray(rgb, dtype=np.uint8).reshape(-1, size, size, 3)
+        patches = np.empty((len(candidates), size, size, 3), np.uint8)
+        for candidate, patch in zip(candidates, patches, strict=True):
+            columns, rows = self._grid(candidate, detail_view, scaling)
+            # The border is mirrored: black would tell the network where the image ends, which no road does.
+            warped = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+            cv2.cvtColor(warped, cv2.COLOR_BGR2RGB, dst=patch)
+        return patches
 
     def _grid(
         self, candidate: Candidate, view: RoadView, scaling: Scaling
