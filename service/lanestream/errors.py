@@ -124,6 +124,12 @@ class TooOldError(LanestreamError):
     code = "session_too_old"
 
 
+class StoreError(LanestreamError):
+    """The store of sessions can't be reached; streams go on, but can't be resumed elsewhere meanwhile."""
+
+    code = "store_unavailable"
+
+
 class LostError(LanestreamError):
     """A frame whose answer was lost with the connection, or with the replica that had it."""
 

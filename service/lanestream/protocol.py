@@ -16,6 +16,7 @@ SUBPROTOCOL: Final = "lanestream.v1"
 
 Point = tuple[float, float]
 Mode = Literal["latest", "all"]
+SessionName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 DetectorName = Literal["candidates", "regression"]
 CameraHeight = Annotated[float, Field(ge=0.3, le=4.0, description="Metres from the road up to the camera.")]
 FieldOfView = Annotated[float, Field(ge=20.0, le=150.0, description="Degrees between the image's left and right edge.")]
@@ -35,9 +36,19 @@ class CameraModel(Message):
 
 
 class StartMessage(Message):
-    """Client: opens the stream. Without it the first frame opens the stream with the defaults."""
+    """Client: opens the stream. Without it the first frame opens the stream with the defaults.
+
+    With the token of a session that lives the stream goes on where that session was, on another socket or on another
+    replica of the service: the same boundaries keep their ids. With a token that nobody knows it begins afresh.
+    """
 
     type: Literal["start"] = "start"
+    session: SessionName | None = Field(
+        default=None, description="A name for the session, seen in logs and in `ready`; made up where absent."
+    )
+    resume_token: Annotated[str, Field(max_length=128)] | None = Field(
+        default=None, description="What `ready` or `draining` told when the session was last open."
+    )
     mode: Mode = "latest"
     detector: DetectorName | None = Field(
         default=None, description="What finds the lanes; the service's default where absent."
@@ -67,16 +78,24 @@ class EndMessage(Message):
 class Limits(Message):
     """What the service accepts."""
 
-    max_bytes: int
-    max_pixels: int
+    max_bytes: int = Field(description="Bytes of one image file at most.")
+    max_pixels: int = Field(description="Pixels of one image at most.")
     credits: int = Field(description="Mode `all`: how many frames may be unanswered at a time.")
+    frames_per_s: float = Field(description="Frames a second at most, on average.")
+    bytes_per_s: float = Field(description="Bytes a second at most, on average.")
+    idle_s: float = Field(description="A stream from which nothing comes for so long is closed.")
+    session_s: float = Field(description="A session ends for good after this time.")
+    resume_s: float = Field(description="How long after its last socket a session can be resumed.")
 
 
 class ReadyMessage(Message):
-    """Service: the stream is open."""
+    """Service: the stream is open. `last_seq` is the last frame that a resumed session has answered for."""
 
     type: Literal["ready"] = "ready"
     session: str
+    resume_token: str = Field(description="Opens this session again; keep it as secret as a key.")
+    resumed: bool = Field(description="Whether the session goes on; false for a new one.")
+    last_seq: int | None
     mode: Mode
     detector: str
     model: str
@@ -185,8 +204,22 @@ class ErrorMessage(Message):
     fatal: bool = False
 
 
+class DrainingMessage(Message):
+    """Service: it is about to stop. Frames that it has taken are answered, later ones refused, then the socket closes.
+
+    The session can be resumed on another replica, or on this one when it is back.
+    """
+
+    type: Literal["draining"] = "draining"
+    resume_token: str | None = Field(description="Null where the stream was opened without `start`.")
+    deadline_s: float = Field(description="The socket is closed after so many seconds at the latest.")
+
+
 class SummaryMessage(Message):
-    """Service: the answer to `end`; `frames` counts received ones, each of them answered, failed or dropped."""
+    """Service: the answer to `end`: what became of the frames that came over this socket.
+
+    `frames` counts received ones, each of them answered, failed or dropped.
+    """
 
     type: Literal["summary"] = "summary"
     frames: int
@@ -197,13 +230,17 @@ class SummaryMessage(Message):
 
 
 ClientMessage = Annotated[StartMessage | FrameMessage | EndMessage, Field(discriminator="type")]
-ServerMessage = Annotated[ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage, Field(discriminator="type")]
+ServerMessage = Annotated[
+    ReadyMessage | LanesMessage | ErrorMessage | DrainingMessage | SummaryMessage, Field(discriminator="type")
+]
+AnyClientMessage = StartMessage | FrameMessage | EndMessage
+AnyServerMessage = ReadyMessage | LanesMessage | ErrorMessage | DrainingMessage | SummaryMessage
 
-_CLIENT: Final[TypeAdapter[StartMessage | FrameMessage | EndMessage]] = TypeAdapter(ClientMessage)
-_SERVER: Final[TypeAdapter[ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage]] = TypeAdapter(ServerMessage)
+_CLIENT: Final[TypeAdapter[AnyClientMessage]] = TypeAdapter(ClientMessage)
+_SERVER: Final[TypeAdapter[AnyServerMessage]] = TypeAdapter(ServerMessage)
 
 
-def parse_client_message(text: str) -> StartMessage | FrameMessage | EndMessage:
+def parse_client_message(text: str) -> AnyClientMessage:
     """The client message in `text`. Raises ProtocolError with one line that says what was wrong."""
     try:
         return _CLIENT.validate_json(text)
@@ -214,7 +251,7 @@ def parse_client_message(text: str) -> StartMessage | FrameMessage | EndMessage:
         ) from None
 
 
-def parse_server_message(text: str) -> ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage:
+def parse_server_message(text: str) -> AnyServerMessage:
     """The service message in `text`. Raises ProtocolError where it is none."""
     try:
         return _SERVER.validate_json(text)

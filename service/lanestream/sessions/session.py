@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import Findings, Network, Pipeline, Prepared, Question, Steps
 from lanestream.lanes import FrameResult, Image
 from lanestream.tracking import LaneTracker
+from lanestream.tracking.state import TrackerState
 
 # The least that a new frame's horizon counts for the camera's: bumps should not move it, a minute of driving should.
 _HORIZON_GAIN = 0.1
+
+
+@dataclass(frozen=True)
+class SessionState:
+    """What a session remembers, as a small value: the size (width, height) of its frames, its horizon, its tracker."""
+
+    size: tuple[int, int] | None
+    horizon: float | None
+    evidence: float
+    tracker: TrackerState
 
 
 class Session:
@@ -29,6 +42,16 @@ class Session:
         self._evidence = 0.0
         self._size: tuple[int, int] | None = None
         self._tracker = LaneTracker()
+
+    @property
+    def state(self) -> SessionState:
+        """All that it remembers. Not to be asked for while a frame is being concluded."""
+        return SessionState(self._size, self._estimate, self._evidence, self._tracker.state)
+
+    def restore(self, state: SessionState, ids_lost: int = 0) -> None:
+        """Goes on where `state` was taken; `ids_lost` as for `LaneTracker.restored`. Raises ValueError for a bad one."""
+        self._tracker = LaneTracker.restored(state.tracker, ids_lost)
+        self._size, self._estimate, self._evidence = state.size, state.horizon, state.evidence
 
     def follow(self, image: Image, timestamp: float) -> Steps[FrameResult]:
         """One frame of the camera, from a BGR image (H, W, 3) uint8 to its lanes; `timestamp` as for `conclude`.

@@ -13,6 +13,7 @@ from lanestream.lanes import Curve, Detection, EgoLane, FloatArray, FrameResult,
 from lanestream.tracking.association import associate, recover
 from lanestream.tracking.filter import Rows, boundary_filter, predict
 from lanestream.tracking.positions import LaneWidth, Sides, positions
+from lanestream.tracking.state import TrackerState, TrackState, told_rows
 from lanestream.tracking.track import Track
 
 
@@ -55,6 +56,37 @@ class LaneTracker:
         self._clock = 0.0
         self._last_timestamp: float | None = None
         self._frames = 0
+
+    @classmethod
+    def restored(cls, state: TrackerState, ids_lost: int = 0) -> LaneTracker:
+        """The tracker that goes on where `state` was taken, with the default settings.
+
+        `ids_lost` more ids are taken as given: by the tracker that went on after `state` was taken, and was lost.
+        Raises ValueError for a state that is none.
+        """
+        tracker = cls()
+        tracker._tracks = [each.track(tracker._settings.birth[1]) for each in state.tracks]
+        tracker._rows = state.followed_rows
+        tracker._width.value = state.lane_width
+        tracker._next_id = state.next_id + ids_lost
+        tracker._clock, tracker._last_timestamp = state.clock, state.last_timestamp
+        tracker._frames = state.frames
+        return tracker
+
+    @property
+    def state(self) -> TrackerState:
+        """All that it remembers, to be restored later."""
+        horizon, rows = told_rows(self._rows)
+        return TrackerState(
+            tracks=tuple(TrackState.of(track) for track in self._tracks),
+            horizon=horizon,
+            rows=rows,
+            lane_width=self._width.value,
+            next_id=self._next_id,
+            clock=self._clock,
+            last_timestamp=self._last_timestamp,
+            frames=self._frames,
+        )
 
     @property
     def curves(self) -> tuple[Curve, ...]:
