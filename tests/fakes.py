@@ -14,6 +14,7 @@ from lanestream.detection import Findings, Pipeline, Prepared
 from lanestream.engine import Engine
 from lanestream.geometry import RoadView, visible_rows
 from lanestream.lanes import Curve, Detection, Image
+from lanestream.protocol import Limits, Mode, ReadyMessage
 
 WAIT_S = 10.0  # far more than anything takes; a test that hangs fails instead
 
@@ -104,3 +105,33 @@ def image_file(kind: str = ".jpg", width: int = 320, height: int = 180, shade: i
     ramp = np.tile(np.linspace(30, 220, width).astype(np.uint8)[None, :, None], (height, 1, 3))
     image = ramp if shade is None else np.full_like(ramp, shade)
     return cv2.imencode(kind, image)[1].tobytes()
+
+
+def limits(**other: float) -> Limits:
+    """Limits as a service tells them, some of them `other`."""
+    usual: dict[str, Any] = {
+        "max_bytes": 99_999,
+        "max_pixels": 99_999,
+        "credits": 3,
+        "frames_per_s": 240.0,
+        "bytes_per_s": 256e6,
+        "idle_s": 60.0,
+        "session_s": 3600.0,
+        "resume_s": 60.0,
+    }
+    return Limits(**{**usual, **other})
+
+
+def ready(mode: Mode = "all", **other: Any) -> ReadyMessage:
+    """What a service says that has opened a new session, some of it `other`."""
+    usual: dict[str, Any] = {
+        "session": "x",
+        "resume_token": "secret",
+        "resumed": False,
+        "last_seq": None,
+        "detector": "candidates",
+        "model": "m",
+        "provider": "cpu",
+        "limits": limits(),
+    }
+    return ReadyMessage(mode=mode, **{**usual, **other})

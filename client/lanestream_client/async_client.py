@@ -11,7 +11,7 @@ from typing import Final, Self
 
 import httpx
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
 from lanestream.protocol import SUBPROTOCOL, CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage, SummaryMessage
@@ -166,6 +166,8 @@ async def _connected(endpoint: Endpoint, timeout: float) -> AsyncIterator[Client
             yield socket
     except ConnectionClosed as error:
         raise lost(error) from None
+    except InvalidStatus as error:
+        raise requests.refused(endpoint.base, error) from None
     except (OSError, TimeoutError, WebSocketException) as error:
         raise requests.unreachable(endpoint.base, error) from None
 

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Final, Self
 
 import httpx
-from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
@@ -129,6 +129,8 @@ def _connected(endpoint: Endpoint, timeout: float) -> Iterator[ClientConnection]
             yield socket
     except ConnectionClosed as error:
         raise lost(error) from None
+    except InvalidStatus as error:
+        raise requests.refused(endpoint.base, error) from None
     except (OSError, TimeoutError, WebSocketException) as error:
         raise requests.unreachable(endpoint.base, error) from None
 

@@ -19,6 +19,7 @@ from lanestream.errors import (
     error_of,
 )
 from lanestream.protocol import (
+    AnyServerMessage,
     CameraModel,
     DetectorName,
     EndMessage,
@@ -163,7 +164,7 @@ def lost(closed: ConnectionClosed) -> LanestreamError:
     return ConnectionFailedError(f"the service closed the stream with code {close.code}{reason}")
 
 
-def _parsed(text: str | bytes) -> ReadyMessage | LanesMessage | ErrorMessage | SummaryMessage:
+def _parsed(text: str | bytes) -> AnyServerMessage:
     if isinstance(text, bytes):
         raise ProtocolError("the service sent a binary message")
     return parse_server_message(text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import Any
 
 import httpx
 from pydantic import ValidationError
+from websockets.exceptions import InvalidStatus
 
 from lanestream.errors import (
     ConnectionFailedError,
@@ -74,13 +76,22 @@ def checked(response: httpx.Response) -> httpx.Response:
     raise _told(response)
 
 
+def refused(place: str, error: InvalidStatus) -> LanestreamError:
+    """The error that the service told when it refused a stream's handshake."""
+    response = error.response
+    return _problem(response.body or b"", place, f"{response.status_code} {response.reason_phrase}")
+
+
 def _told(response: httpx.Response) -> LanestreamError:
+    return _problem(response.content, str(response.url), f"{response.status_code} {response.reason_phrase}")
+
+
+def _problem(body: bytes | bytearray, place: str, status: str) -> LanestreamError:
     try:
-        problem: dict[str, Any] = response.json()
+        problem: dict[str, Any] = json.loads(body)
         return error_of(problem["code"], problem["message"], problem["hint"])
     except (ValueError, TypeError, KeyError):
-        status = f"{response.status_code} {response.reason_phrase}".rstrip()
-        return ConnectionFailedError(f"{response.url} answered {status}", "is this a Lanestream service?")
+        return ConnectionFailedError(f"{place} answered {status.rstrip()}", "is this a Lanestream service?")
 
 
 @contextmanager

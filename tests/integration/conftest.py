@@ -8,10 +8,9 @@ from contextlib import ExitStack, contextmanager
 
 import fakes
 import pytest
-import uvicorn
 
 from lanestream.api import create_app
-from lanestream.api.server import listen, server_config
+from lanestream.api.server import Server, listen
 from lanestream.engine import Engine, load_engine
 from lanestream.settings import Settings
 from lanestream_client.overlays import draw_lanes
@@ -24,7 +23,7 @@ def serving(engine: Engine | None, settings: Settings) -> Iterator[str]:
     """The URL of a server around `engine`."""
     app = create_app(engine, settings, draw_lanes)
     listener = listen("127.0.0.1", 0)
-    server = uvicorn.Server(server_config(app, settings))
+    server = Server(app, settings)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     thread.start()

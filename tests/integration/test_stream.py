@@ -12,7 +12,7 @@ from typing import Any
 
 import fakes
 import pytest
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from lanestream.detection import Pipeline
@@ -80,13 +80,25 @@ def test_start_is_answered_with_what_runs_and_what_is_accepted(url: str) -> None
         tell(socket, "start", mode="all")
         ready = heard(socket)
     assert len(ready.pop("session")) == 16
+    assert len(ready.pop("resume_token")) >= 32
     assert ready == {
         "type": "ready",
+        "resumed": False,
+        "last_seq": None,
         "mode": "all",
         "detector": "candidates",
         "model": "fake 1",
         "provider": "cpu",
-        "limits": {"max_bytes": 200_000, "max_pixels": 4096 * 2304, "credits": 8},
+        "limits": {
+            "max_bytes": 200_000,
+            "max_pixels": 4096 * 2304,
+            "credits": 8,
+            "frames_per_s": 240.0,
+            "bytes_per_s": 256e6,
+            "idle_s": 60.0,
+            "session_s": 86_400.0,
+            "resume_s": 60.0,
+        },
     }
 
 
@@ -285,9 +297,14 @@ def test_pings_are_answered_while_the_network_runs(serve: Serve) -> None:
         network.let_through(2)
 
 
-def test_more_bytes_than_a_message_may_have_close_the_stream(url: str) -> None:
+def test_an_image_of_too_many_bytes_costs_itself_and_one_far_beyond_them_the_socket(url: str) -> None:
     with stream(url, mode="all") as socket:
         socket.send(bytes(200_001))
+        told = heard(socket)
+        assert (told["code"], told["seq"], told["fatal"]) == ("image_too_large", 0, False)
+        socket.send(fakes.image_file())
+        assert heard(socket)["seq"] == 1
+        socket.send(bytes(400_001))
         assert closed(socket)[0] == 1009
 
 
@@ -318,10 +335,10 @@ def test_a_client_that_goes_away_in_the_middle_of_a_frame_frees_its_place(serve:
 
 
 def test_a_stream_before_the_network_is_loaded_is_told_to_come_again(serve: Serve) -> None:
-    with stream(serve()) as socket:
-        tell(socket, "start")
-        assert heard(socket)["code"] == "not_ready"
-        assert closed(socket)[0] == 1013
+    with pytest.raises(InvalidStatus) as refused, stream(serve()):
+        pass
+    assert refused.value.response.status_code == 503
+    assert json.loads(refused.value.response.body)["code"] == "not_ready"
 
 
 def test_streams_with_different_detectors_run_at_the_same_time(both_url: str) -> None:

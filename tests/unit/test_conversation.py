@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import fakes
 import pytest
 from websockets.exceptions import ConnectionClosedError
 from websockets.frames import Close
@@ -20,23 +21,14 @@ from lanestream.protocol import (
     EgoModel,
     ErrorMessage,
     LanesMessage,
-    Limits,
     Mode,
-    ReadyMessage,
     SummaryMessage,
     TimingModel,
 )
 from lanestream_client.conversation import Conversation, lost
 from lanestream_client.frames import SourceFrame
 
-READY = ReadyMessage(
-    session="s",
-    mode="all",
-    detector="candidates",
-    model="m",
-    provider="cpu",
-    limits=Limits(max_bytes=10, max_pixels=99_999, credits=8),
-)
+READY = fakes.ready(limits=fakes.limits(max_bytes=10, credits=8))
 SUMMARY = SummaryMessage(frames=3, answered=3, failed=0, dropped=0, duration_s=1.0)
 
 

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from lanestream.errors import OverrunError, ProtocolError
 from lanestream.protocol import FrameMessage, Mode, StartMessage
-from lanestream.sessions.stream_rules import StreamRules
+from lanestream.sessions.stream_rules import Outcome, StreamLimits, StreamRules
 
 
 def opened(mode: Mode, most: int = 3) -> StreamRules:
-    rules = StreamRules(most, now=100.0)
-    rules.start(StartMessage(mode=mode))
+    rules = StreamRules(StreamLimits(credits=most), now=100.0)
+    rules.start(StartMessage(mode=mode), 100.0)
     return rules
 
 
@@ -28,20 +28,20 @@ def counts(rules: StreamRules) -> tuple[int, int, int, int]:
 
 
 def test_a_first_frame_opens_the_stream_with_the_defaults() -> None:
-    rules = StreamRules(3, now=100.0)
+    rules = StreamRules(StreamLimits(), now=100.0)
     assert not rules.is_open
     rules.receive(b"x", 100.5)
     assert rules.is_open
     assert rules.mode == "latest"
     with pytest.raises(ProtocolError, match="open already"):
-        rules.start(StartMessage())
+        rules.start(StartMessage(), 101.0)
 
 
 def test_frames_are_numbered_and_timed_where_the_client_does_not() -> None:
     rules = opened("all")
     rules.receive(b"a", 100.5)
-    rules.announce(FrameMessage(seq=41, timestamp=-7.0))
-    rules.announce(FrameMessage(seq=42))
+    rules.announce(FrameMessage(seq=41, timestamp=-7.0), 100.5)
+    rules.announce(FrameMessage(seq=42), 100.6)
     rules.receive(b"b", 100.6)
     rules.receive(b"c", 100.75)
     taken = []
@@ -49,7 +49,7 @@ def test_frames_are_numbered_and_timed_where_the_client_does_not() -> None:
         frame = rules.take()
         assert frame is not None
         taken.append((frame.seq, round(frame.timestamp, 3), frame.data, frame.arrived))
-        rules.settle(answered=True)
+        rules.settle(Outcome.ANSWERED, 102.0)
     assert taken == [(0, 0.5, b"a", 100.5), (42, 0.6, b"b", 100.6), (43, 0.75, b"c", 100.75)]
 
 
@@ -59,7 +59,7 @@ def test_one_frame_is_worked_on_at_a_time() -> None:
     rules.receive(b"b", 101.0)
     assert next_seq(rules) == 0
     assert next_seq(rules) is None
-    rules.settle(answered=True)
+    rules.settle(Outcome.ANSWERED, 102.0)
     assert next_seq(rules) == 1
 
 
@@ -70,9 +70,9 @@ def test_latest_keeps_the_newest_waiting_frame() -> None:
     for _ in range(4):
         rules.receive(b"b", 101.0)
     assert rules.dropped == 3
-    rules.settle(answered=True)
+    rules.settle(Outcome.ANSWERED, 102.0)
     assert next_seq(rules) == 4
-    rules.settle(answered=False)
+    rules.settle(Outcome.FAILED, 102.0)
     assert counts(rules) == (5, 1, 1, 3)
 
 
@@ -84,7 +84,7 @@ def test_a_frame_whose_turn_has_come_is_not_replaced() -> None:
     rules.receive(b"c", 101.0)
     assert rules.dropped == 1
     assert next_seq(rules) == 0
-    rules.settle(answered=True)
+    rules.settle(Outcome.ANSWERED, 102.0)
     assert next_seq(rules) == 2
 
 
@@ -98,7 +98,7 @@ def test_all_grants_credits_and_an_answer_renews_one() -> None:
     rules.take()
     with pytest.raises(OverrunError):
         rules.receive(b"c", 101.0)
-    rules.settle(answered=False)
+    rules.settle(Outcome.FAILED, 102.0)
     rules.receive(b"c", 101.0)
     assert counts(rules) == (3, 0, 1, 0)
 
@@ -106,24 +106,24 @@ def test_all_grants_credits_and_an_answer_renews_one() -> None:
 def test_the_end_waits_for_what_is_held() -> None:
     rules = opened("all")
     rules.receive(b"a", 101.0)
-    rules.end()
+    rules.end(101.0)
     assert not rules.finished
     rules.take()
     assert not rules.finished
-    rules.settle(answered=True)
+    rules.settle(Outcome.ANSWERED, 102.0)
     assert rules.finished
     assert rules.summary(103.25).duration_s == 3.25
 
 
 def test_nothing_may_follow_the_end() -> None:
-    rules = StreamRules(3, now=0.0)
-    rules.end()
+    rules = StreamRules(StreamLimits(), now=0.0)
+    rules.end(101.0)
     assert rules.finished
     for late in (
-        rules.end,
+        lambda: rules.end(1.0),
         lambda: rules.receive(b"x", 1.0),
-        lambda: rules.announce(FrameMessage()),
-        lambda: rules.start(StartMessage()),
+        lambda: rules.announce(FrameMessage(), 1.0),
+        lambda: rules.start(StartMessage(), 101.0),
     ):
         with pytest.raises(ProtocolError, match="after `end`"):
             late()
@@ -151,12 +151,12 @@ def test_every_frame_is_answered_failed_or_dropped(mode: Mode, steps: list[str])
         elif step == "t":
             busy = take() or busy
         elif busy:
-            rules.settle(answered=step == "s")
+            rules.settle(Outcome.ANSWERED if step == "s" else Outcome.FAILED, 102.0)
             busy = False
-    rules.end()
+    rules.end(101.0)
     while not rules.finished:
         if busy or take():
-            rules.settle(answered=True)
+            rules.settle(Outcome.ANSWERED, 102.0)
             busy = False
     frames, answered, failed, dropped = counts(rules)
     assert frames == answered + failed + dropped

@@ -19,6 +19,7 @@ from lanestream.api.service import Service
 from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
 from lanestream.messages import lanes_message
 from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
+from lanestream.sessions.caller import Caller
 from lanestream.sessions.runner import EncodedFrame
 
 if TYPE_CHECKING:
@@ -126,9 +127,11 @@ async def detect(
 ) -> Response:
     """The lanes of one image, sent as the body or as the file of a form; as JSON, or drawn on it by `Accept`."""
     service = _service(request)
+    service.check_open()
     loaded = service.loaded
     form = _answer_form(request, service.draw)
-    with service.sessions.opened(loaded.engine, horizon, detector) as opened:
+    host = request.client.host if request.client else "unknown"
+    with service.sessions.opened(loaded.engine, Caller("anonymous", host), horizon, detector) as opened:
         data = await _image_bytes(request, service.settings.image_limits)
         frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic()))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
@@ -159,7 +162,8 @@ async def healthz() -> dict[str, str]:
 
 @router.get("/readyz", responses={503: _PROBLEMS[503]})
 async def readyz(request: Request) -> Readiness:
-    """Answers once the networks are loaded and warm."""
+    """Answers once the networks are loaded and warm, until the service is about to stop."""
+    _service(request).check_open()
     networks = [NetworkEntry.of(pipeline) for pipeline in _service(request).loaded.engine.pipelines]
     return Readiness(status="ready", provider=networks[0].provider, networks=networks)
 

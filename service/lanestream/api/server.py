@@ -21,7 +21,7 @@ from lanestream.errors import SettingsError
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from lanestream.api.service import Draw
+    from lanestream.api.service import Draw, Service
     from lanestream.engine import Engine
     from lanestream.settings import Settings
 
@@ -38,7 +38,7 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: Draw | None = No
     cv2.setNumThreads(settings.opencv_threads)
     listener = listen(settings.host, settings.port)
     app = create_app(None, settings, draw)
-    server = uvicorn.Server(server_config(app, settings))
+    server = Server(app, settings)
     with suppress(KeyboardInterrupt), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
         runner.run(_serve(server, listener, app, load))
 
@@ -60,10 +60,24 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         ws="websockets-sansio",
-        ws_max_size=settings.max_bytes,
+        # What is somewhat too large gets an error of its own; what is far too large costs the socket, not the session.
+        ws_max_size=2 * settings.max_bytes,
         ws_per_message_deflate=False,
         log_config=_log_config(),
     )
+
+
+class Server(uvicorn.Server):
+    """A uvicorn server that answers what it has taken before it stops."""
+
+    def __init__(self, app: FastAPI, settings: Settings) -> None:
+        super().__init__(server_config(app, settings))
+        self._service: Service = app.state.service
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Drains the streams, then stops as uvicorn does: the other way round answers would meet closed sockets."""
+        await self._service.drain()
+        await super().shutdown(sockets)
 
 
 async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from lanestream.api.metrics import Metrics
-from lanestream.errors import NotReadyError
+from lanestream.errors import DrainingError, NotReadyError
 from lanestream.protocol import Limits
 from lanestream.sessions.manager import SessionManager
 from lanestream.sessions.runner import FrameRunner
+from lanestream.sessions.store import MemoryStore, SessionStore
 
 if TYPE_CHECKING:
+    from lanestream.api.stream import StreamHandler
     from lanestream.engine import Engine
     from lanestream.lanes import Image
     from lanestream.protocol import LanesMessage
     from lanestream.settings import Settings
 
 Draw = Callable[["Image", "LanesMessage"], "Image"]
+
+_DRAIN_STEP_S: Final = 0.02
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,10 @@ class Service:
         self.settings = settings
         self.draw = draw
         self.metrics = Metrics()
-        self.sessions = SessionManager(settings.max_sessions)
+        self.streams: set[StreamHandler] = set()
+        self.draining = False
+        self._store = _store(settings)
+        self.sessions = SessionManager(settings.session_limits, self._store)
         self._loaded: Loaded | None = None
 
     @property
@@ -54,7 +62,22 @@ class Service:
     def limits(self) -> Limits:
         """What clients are told of the limits."""
         settings = self.settings
-        return Limits(max_bytes=settings.max_bytes, max_pixels=settings.max_pixels, credits=settings.credits)
+        return Limits(
+            max_bytes=settings.max_bytes,
+            max_pixels=settings.max_pixels,
+            credits=settings.credits,
+            frames_per_s=settings.frames_per_s,
+            bytes_per_s=settings.bytes_per_s,
+            idle_s=settings.idle_s,
+            session_s=settings.session_s,
+            resume_s=settings.resume_s,
+        )
+
+    def check_open(self) -> None:
+        """Raises NotReadyError before there is an engine, and DrainingError where nothing new is taken any more."""
+        if self.draining:
+            raise DrainingError("the service is about to stop", "ask another replica, or again in a moment")
+        _ = self.loaded
 
     def install(self, engine: Engine) -> None:
         """Makes the service ready with a warm engine."""
@@ -63,8 +86,31 @@ class Service:
             self.metrics.loaded(pipeline)
         self._loaded = Loaded(engine, runner)
 
+    async def drain(self) -> None:
+        """Takes nothing new, tells the streams, and waits until all frames that came before are answered.
+
+        What is not answered within the setting `drain_s` is given up.
+        """
+        self.draining = True
+        for stream in self.streams:
+            stream.wake()
+        ends = time.monotonic() + self.settings.drain_s
+        while self.streams and time.monotonic() < ends:
+            await asyncio.sleep(_DRAIN_STEP_S)
+
     async def close(self) -> None:
         """Stops being ready and ends the threads after what they are at."""
         loaded, self._loaded = self._loaded, None
+        await self._store.close()
         if loaded is not None:
             await asyncio.to_thread(loaded.runner.close)
+
+
+def _store(settings: Settings) -> SessionStore:
+    """Where the service keeps sessions. Raises SettingsError for a URL that is none."""
+    if settings.redis_url is None:
+        return MemoryStore()
+    # Only who has replicas needs the package.
+    from lanestream.sessions.redis_store import RedisStore
+
+    return RedisStore(settings.redis_url.get_secret_value())

@@ -71,6 +71,7 @@ class OpenSession:
     saved_at: float = 0.0
     saving: asyncio.Task[None] | None = None
     later: asyncio.TimerHandle | None = None
+    changed: bool = False
     gone: asyncio.Event = field(default_factory=asyncio.Event)
 
     @property
@@ -93,6 +94,7 @@ class SessionManager:
         self._wall = wall
         self._open: set[OpenSession] = set()
         self._by_key: dict[str, OpenSession] = {}
+        self._store_works = True
 
     def __len__(self) -> int:
         return len(self._open)
@@ -131,7 +133,7 @@ class SessionManager:
             self._open.discard(opened)
 
     async def start(self, engine: Engine, caller: Caller, message: StartMessage) -> OpenSession:
-        """The session that `message` asks for: the one of its token, where that lives and is the caller's, or a new one.
+        """The session that `message` asks for: that of its token, where it lives and is the caller's, else a new one.
 
         Raises BusyError at a limit, NoDetectorError where its detector is not loaded.
         """
@@ -152,6 +154,7 @@ class SessionManager:
 
     def note(self, opened: OpenSession) -> None:
         """Tells that a session has changed: it is saved at once, or once the last time is long enough ago."""
+        opened.changed = opened.saving is not None
         if opened.token is None or opened.saving is not None or opened.later is not None or opened.working:
             return
         wait = opened.saved_at + self._limits.save_s - time.monotonic()
@@ -201,7 +204,7 @@ class SessionManager:
         try:
             data = await self._store.take(key, caller.identity, owner)
         except StoreError as error:
-            _log.warning("a session can't be resumed: %s", error)
+            self._store_failed(error)
             return None
         record = None if data is None else SessionRecord.of_bytes(data)
         if record is None or self._wall() - record.born >= self._limits.session_s:
@@ -239,6 +242,8 @@ class SessionManager:
             await self._save(opened, record, self._limits.resume_s + self._limits.idle_s)
         finally:
             opened.saving = None
+        if opened.changed:
+            self.note(opened)
 
     async def _save(self, opened: OpenSession, record: SessionRecord, ttl_s: float) -> None:
         if opened.key is None:
@@ -248,7 +253,9 @@ class SessionManager:
             if not await self._store.save(opened.key, entry, ttl_s):
                 opened.evict()
         except StoreError as error:
-            _log.warning("session %s was not saved: %s", opened.id, error)
+            self._store_failed(error)
+        else:
+            self._store_works = True
 
     async def _forget(self, opened: OpenSession) -> None:
         if opened.key is None:
@@ -256,4 +263,10 @@ class SessionManager:
         try:
             await self._store.forget(opened.key, opened.owner)
         except StoreError as error:
-            _log.warning("session %s was not forgotten: %s", opened.id, error)
+            self._store_failed(error)
+
+    def _store_failed(self, error: StoreError) -> None:
+        """Logs that sessions can't be saved or resumed, once until they can be again."""
+        if self._store_works:
+            _log.warning("sessions are not saved and can't be resumed elsewhere: %s", error)
+        self._store_works = False

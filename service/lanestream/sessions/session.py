@@ -49,7 +49,10 @@ class Session:
         return SessionState(self._size, self._estimate, self._evidence, self._tracker.state)
 
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
-        """Goes on where `state` was taken; `ids_lost` as for `LaneTracker.restored`. Raises ValueError for a bad one."""
+        """Goes on where `state` was taken; `ids_lost` as for `LaneTracker.restored`. Raises ValueError for a bad one.
+
+        The session is then as it was before.
+        """
         self._tracker = LaneTracker.restored(state.tracker, ids_lost)
         self._size, self._estimate, self._evidence = state.size, state.horizon, state.evidence
 

@@ -133,7 +133,7 @@ class StreamRules:
 
     @property
     def finished(self) -> bool:
-        """Whether the stream has come to its end, by the client's `end` or by draining, and every frame was answered."""
+        """Whether the stream is at its end, by the client's `end` or by draining, and every frame was answered."""
         if self._busy:
             return False
         if self._draining and not self._ended:
