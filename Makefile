@@ -11,11 +11,17 @@ comma := ,
 BIN := $(VENV)/bin
 VIDEO ?=
 
+# Docker, or podman where there is no docker; the image's variant is cpu or gpu.
+ENGINE ?= $(if $(shell command -v docker),docker,podman)
+VARIANT ?= cpu
+VERSION = $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' service/lanestream/__init__.py)
+REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
+
 # What an environment was last set up for; pyproject.toml is what it depends on.
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: evaluate proposals demo serve train-toy test lint picture clean
+.PHONY: evaluate proposals demo serve train-toy test lint picture image image-test clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -46,6 +52,14 @@ proposals: $(DEV_READY)
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
+
+# Podman's own image format has no place for a health check.
+image:
+	$(ENGINE) build $(if $(findstring podman,$(ENGINE)),--format docker) -f docker/Dockerfile --target $(VARIANT) \
+	  --build-arg VERSION=$(VERSION) --build-arg REVISION=$(REVISION) -t lanestream:$(VARIANT) .
+
+image-test: $(RUN_READY)
+	$(BIN)/python tools/image_check.py --target $(VARIANT)
 
 clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .hypothesis
