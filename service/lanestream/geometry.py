@@ -7,13 +7,14 @@ resize by s maps x to s (x + 0.5) - 0.5.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.lanes import Curve, FloatArray
+from lanestream.lanes import Curve, FloatArray, curve_columns
 
 T = TypeVar("T", float, FloatArray)
 
@@ -104,16 +105,20 @@ def visible_rows(curve: Curve, view: RoadView, top_share: float) -> tuple[float,
     None where fewer than two rows of it are in view. Where a bent curve leaves and comes back, the part that begins
     nearest to the camera counts.
     """
+    return visible_spans([curve], view, top_share)[0]
+
+
+def visible_spans(curves: Sequence[Curve], view: RoadView, top_share: float) -> list[tuple[float, float] | None]:
+    """`visible_rows` of each of the `curves`, at once."""
     rows = np.linspace(view.bottom, view.row_at(top_share), 65)
-    columns = curve.x(rows)
+    columns = curve_columns(curves, rows)
     inside = (columns >= 0.0) & (columns <= view.width - 1.0)
-    if not inside.any():
-        return None
-    first = int(np.argmax(inside))
-    outside_again = np.flatnonzero(~inside[first:])
-    last = first + int(outside_again[0]) - 1 if len(outside_again) else len(rows) - 1
-    top, bottom = float(rows[last]), float(rows[first])
-    return (top, bottom) if bottom - top >= 2.0 else None
+    first = inside.argmax(axis=1)
+    left = ~inside & (np.arange(len(rows)) > first[:, None])
+    last = np.where(left.any(axis=1), left.argmax(axis=1), len(rows)) - 1
+    spans = zip(rows[last].tolist(), rows[first].tolist(), strict=True)
+    # Of a curve that is nowhere inside, the span is its first row alone.
+    return [(top, bottom) if bottom - top >= 2.0 else None for top, bottom in spans]
 
 
 @dataclass(frozen=True)

@@ -66,9 +66,11 @@ def find_edges(grey: Image, top: int) -> Edges:
     # 24 grey levels of a 3 x 3 Sobel are a step of six levels: about the noise of a dark dash-cam frame.
     gain = 128.0 / (cv2.blur(magnitude, (63, 31)) + 24.0)
     edges = cv2.Canny((dx * gain).astype(np.int16), (dy * gain).astype(np.int16), 120, 280, L2gradient=True)
-    rows, columns = np.nonzero(edges)
-    angle = np.degrees(np.arctan2(dy[rows, columns], dx[rows, columns])) % 360.0
-    weight = np.minimum(magnitude[rows, columns] * gain[rows, columns] / 640.0, 1.0)
+    found = cv2.findNonZero(edges)
+    columns, rows = np.empty((2, 0), np.int32) if found is None else found[:, 0].T
+    at = rows * edges.shape[1] + columns
+    angle = np.degrees(np.arctan2(dy.take(at), dx.take(at))) % 360.0
+    weight = np.minimum(magnitude.take(at) * gain.take(at) / 640.0, 1.0)
     return Edges(
         columns.astype(np.float32),
         (rows + top).astype(np.float32),

@@ -8,7 +8,9 @@ collinearity of feature points", 1976 (votes limited by the gradient); T. Petkov
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -16,7 +18,10 @@ from numpy.typing import NDArray
 
 from lanestream.detection.edges import Edges
 
-_CIRCLE = 360
+_CIRCLE: Final = 360
+
+# Columns by which the angle axis goes on at either end, so that peaks there have all their neighbours.
+_PAD: Final = 3
 
 
 @dataclass(frozen=True)
@@ -52,56 +57,91 @@ class ExtendedHough:
     def lines(self, edges: Edges, width: int, bottom: float) -> HoughLines:
         """Lines in `edges` of an image `width` pixels wide, told at the row `bottom`."""
         origin_x, origin_y = (width - 1) / 2.0, bottom
-        accumulator, reach = self._accumulate(edges, origin_x, origin_y)
-        rho, theta, votes = self._peaks(accumulator)
-        angle = np.radians(theta)
-        slope = -np.tan(angle)
-        x_bottom = origin_x + (rho - reach) / np.cos(angle)
-        return HoughLines(x_bottom, slope, np.cos(angle) > 0.0, votes)
-
-    def _accumulate(self, edges: Edges, origin_x: float, origin_y: float) -> tuple[NDArray[np.float32], int]:
         x, y, angle, weight = self._steep(edges, origin_x, origin_y)
-        reach = int(np.ceil(np.hypot(origin_x, origin_y))) + 2
-        spread = np.arange(-int(self.window), int(self.window) + 1)
+        if not len(x):
+            nothing = np.empty(0)
+            return HoughLines(nothing, nothing, nothing > 0.0, nothing)
+        reach = int(np.ceil(np.hypot(origin_x, float(np.abs(y).max())))) + 2
+        rho, theta, votes = self._peaks(self._accumulate(x, y, angle, weight, reach))
+        radians = np.radians(theta)
+        slope = -np.tan(radians)
+        x_bottom = origin_x + (rho - reach) / np.cos(radians)
+        return HoughLines(x_bottom, slope, np.cos(radians) > 0.0, votes)
+
+    def _accumulate(
+        self,
+        x: NDArray[np.float32],
+        y: NDArray[np.float32],
+        angle: NDArray[np.float32],
+        weight: NDArray[np.float32],
+        reach: int,
+    ) -> NDArray[np.float32]:
+        """Votes by rho, from -`reach` to `reach`, and theta, with `_PAD` columns of the other end at either end.
+
+        A pixel that lies at rho and t, across and along the line of its own direction, lies at rho cos d + t sin d
+        across one that is turned by d.
+        """
+        window = int(self.window)
+        turns = np.radians(np.arange(-window, window + 1)).astype(np.float32)
+        direction = np.rint(angle).astype(np.int32) % _CIRCLE
+        radians = np.radians(np.arange(_CIRCLE)).astype(np.float32)
+        cosine, sine = np.cos(radians)[direction], np.sin(radians)[direction]
+        # Half a cell more, because what follows rounds down.
+        rho = (x * cosine + y * sine)[:, None] * np.cos(turns) + np.float32(reach + 0.5)
+        rho += (y * cosine - x * sine)[:, None] * np.sin(turns)
+        margin = window + _PAD
+        columns = _CIRCLE + 2 * margin
+        cell = rho.astype(np.int32)
+        cell *= columns
+        cell += direction[:, None] + np.arange(_PAD, _PAD + len(turns), dtype=np.int32)
+        votes = np.repeat(weight, len(turns))
+        size = (2 * reach + 1) * columns
+        counts = np.bincount(cell.ravel(), votes, minlength=size).astype(np.float32).reshape(-1, columns)
         # Modulo the circle: a vote beyond 359 degrees is one at 0 degrees, not a lost or a shifted one.
-        theta = (np.rint(angle).astype(np.int64)[:, None] + spread) % _CIRCLE
-        turns = np.radians(np.arange(_CIRCLE)).astype(np.float32)
-        cosine, sine = np.cos(turns), np.sin(turns)
-        rho = np.rint(x[:, None] * cosine[theta] + y[:, None] * sine[theta]).astype(np.int64) + reach
-        votes = np.broadcast_to(weight[:, None], theta.shape)
-        size = 2 * reach + 1
-        counts = np.bincount((rho * _CIRCLE + theta).ravel(), votes.ravel(), minlength=size * _CIRCLE)
-        return counts.reshape(size, _CIRCLE).astype(np.float32), reach
+        counts[:, _CIRCLE : _CIRCLE + margin] += counts[:, :margin]
+        counts[:, margin : 2 * margin] += counts[:, _CIRCLE + margin :]
+        counts[:, :margin] = counts[:, _CIRCLE : _CIRCLE + margin]
+        counts[:, _CIRCLE + margin :] = counts[:, margin : 2 * margin]
+        return counts[:, window : columns - window]
 
     def _steep(
         self, edges: Edges, origin_x: float, origin_y: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Pixels that can belong to a line steep enough, about the origin; the others would only cost votes."""
-        flattest = np.degrees(np.arctan(self.max_slope))
-        from_horizontal = np.abs((edges.angle + 90.0) % 180.0 - 90.0)
-        keep = from_horizontal <= flattest
-        return edges.x[keep] - origin_x, edges.y[keep] - origin_y, edges.angle[keep], edges.weight[keep]
+        keep = np.flatnonzero(_from_upright(edges.angle) <= self._flattest)
+        x, y = edges.x[keep] - np.float32(origin_x), edges.y[keep] - np.float32(origin_y)
+        return x, y, edges.angle[keep], edges.weight[keep]
+
+    @property
+    def _flattest(self) -> float:
+        return math.degrees(math.atan(self.max_slope))
 
     def _peaks(
         self, accumulator: NDArray[np.float32]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """(rho index, theta in degrees, votes) of the strongest local maxima, to a fraction of a cell."""
-        pad = 3
-        wrapped = np.hstack([accumulator[:, -pad:], accumulator, accumulator[:, :pad]])
-        smooth = np.asarray(cv2.GaussianBlur(wrapped, (3, 3), 0.7), dtype=np.float32)
-        highest = cv2.dilate(smooth, np.ones((5, 5), np.uint8))
-        is_peak = (smooth == highest) & (smooth >= self.min_votes)
-        is_peak[:, :pad] = is_peak[:, -pad:] = False
-        is_peak[:1] = is_peak[-1:] = False
-        theta = np.arange(-pad, _CIRCLE + pad)
-        flattest = np.degrees(np.arctan(self.max_slope))
-        is_peak[:, np.abs((theta + 90.0) % 180.0 - 90.0) > flattest] = False
-        rows, columns = np.nonzero(is_peak)
-        order = np.argsort(smooth[rows, columns], kind="stable")[::-1][: self.limit]
-        rows, columns = rows[order], columns[order]
+        smooth = np.asarray(cv2.GaussianBlur(accumulator, (3, 3), 0.7), dtype=np.float32)
+        # Few cells have enough votes, so only those are compared with their neighbours, two cells to either side.
+        high = np.flatnonzero(smooth >= self.min_votes)
+        rows, columns = np.divmod(high, smooth.shape[1])
+        theta = columns - _PAD
+        is_line = (theta >= 0) & (theta < _CIRCLE) & (_from_upright(theta) <= self._flattest)
+        high = high[is_line & (rows >= 2) & (rows < len(smooth) - 2)]
+        steps = np.arange(-2, 3)
+        around = (steps[:, None] * smooth.shape[1] + steps).ravel()
+        flat = smooth.ravel()
+        high = high[flat[high] >= flat[high[:, None] + around].max(axis=1)]
+        order = np.argsort(-flat[high], kind="stable")[: self.limit]
+        rows, columns = np.divmod(high[order], smooth.shape[1])
         rho = rows + _vertex(smooth, rows, columns, (1, 0))
-        angle = theta[columns] + _vertex(smooth, rows, columns, (0, 1))
+        angle = columns - _PAD + _vertex(smooth, rows, columns, (0, 1))
         return rho, angle, smooth[rows, columns].astype(np.float64)
+
+
+def _from_upright(degrees: NDArray[Any]) -> NDArray[Any]:
+    """How far a line's normal is from the horizontal, and the line from upright, in degrees from 0 to 90."""
+    away: NDArray[Any] = np.abs((degrees + 90.0) % 180.0 - 90.0)
+    return away
 
 
 def _vertex(

@@ -6,9 +6,12 @@ heights: there lanes are equally wide.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
+
+import numpy as np
+
+from lanestream.lanes import FloatArray
 
 # Lanes are 2.5 to 4.5 m wide and cameras 1 to 2.4 m high; what is usual stands in where one boundary was seen alone.
 _USUAL: Final = 2.4
@@ -48,10 +51,11 @@ class Lattice:
         """The next boundaries out on both sides."""
         return self.left - self.width, self.right + self.width
 
-    def trust(self, slope: float) -> float:
-        """How likely a line with this slope is a boundary, from 0 to 1, judged by its place alone."""
-        is_left = slope < 0.5 * (self.left + self.right)
-        beyond = (self.left - slope if is_left else slope - self.right) / self.width
-        lanes = max(0, round(beyond))
-        near = math.exp(-0.5 * ((beyond - lanes) / self.spread) ** 2)
-        return (self.least + (1.0 - self.least) * near) * (1.0 if lanes <= 1 else self.outer)
+    def trust(self, slopes: FloatArray) -> FloatArray:
+        """How likely lines with these slopes (N,) are boundaries, from 0 to 1, judged by their places alone."""
+        is_left = slopes < 0.5 * (self.left + self.right)
+        beyond = np.where(is_left, self.left - slopes, slopes - self.right) / self.width
+        lanes = np.maximum(0.0, np.rint(beyond))
+        near = np.exp(-0.5 * ((beyond - lanes) / self.spread) ** 2)
+        trust: FloatArray = (self.least + (1.0 - self.least) * near) * np.where(lanes <= 1.0, 1.0, self.outer)
+        return trust
