@@ -83,7 +83,7 @@ class ExtendedHough:
         """
         window = int(self.window)
         turns = np.radians(np.arange(-window, window + 1)).astype(np.float32)
-        direction = np.rint(angle).astype(np.int32) % _CIRCLE
+        direction: NDArray[np.int32] = np.rint(angle).astype(np.int32) % _CIRCLE
         radians = np.radians(np.arange(_CIRCLE)).astype(np.float32)
         cosine, sine = np.cos(radians)[direction], np.sin(radians)[direction]
         # Half a cell more, because what follows rounds down.
@@ -93,7 +93,8 @@ class ExtendedHough:
         columns = _CIRCLE + 2 * margin
         cell = rho.astype(np.int32)
         cell *= columns
-        cell += direction[:, None] + np.arange(_PAD, _PAD + len(turns), dtype=np.int32)
+        cell += direction[:, None]
+        cell += np.arange(_PAD, _PAD + len(turns), dtype=np.int32)
         votes = np.repeat(weight, len(turns))
         size = (2 * reach + 1) * columns
         counts = np.bincount(cell.ravel(), votes, minlength=size).astype(np.float32).reshape(-1, columns)
