@@ -15,6 +15,7 @@ import click
 
 from lanestream import __version__
 from lanestream.errors import LanestreamError, needs_extra
+from lanestream.keys import new_key
 from lanestream.runtime import PROVIDERS
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ def cli(context: click.Context) -> None:
 
 
 @cli.command()
+@click.option("--config", type=click.Path(path_type=Path), help="TOML file with settings.")
 @click.option("--host", help="Address to listen on  [default: 127.0.0.1]")
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]")
 @click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
@@ -99,18 +101,41 @@ def cli(context: click.Context) -> None:
 )
 @click.option("--provider", type=click.Choice(PROVIDERS), help="Where the networks run  [default: auto]")
 @click.option("--max-sessions", type=click.IntRange(1), help="Streams at a time at most  [default: 64]")
-def serve(**given: Any) -> None:
-    """Serve lanes over HTTP and WebSockets. Everything can also be set by LANESTREAM_<NAME>."""
+@click.option("--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 a line.")
+@click.option("--log-format", type=click.Choice(["text", "json"]), help="Form of the log  [default: text]")
+@click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), help="[default: info]")
+@click.option("--print-config", is_flag=True, help="Print all settings, secrets masked, and end.")
+def serve(*, print_config: bool, **given: Any) -> None:
+    """Serve lanes over HTTP and WebSockets.
+
+    Everything can also be set by LANESTREAM_<NAME>, or in the file of --config; --print-config prints all there is.
+    """
     with needs_extra("service,cpu"):
         # The image module comes first, because OpenCV reads its limit once.
         from lanestream.api.server import serve as run
         from lanestream.engine import chosen_regressor, load_engine
-        from lanestream.settings import load_settings
+        from lanestream.settings import load_settings, shown
         from lanestream_client.overlays import draw_lanes
     settings = load_settings(**given)
+    if print_config:
+        click.echo(shown(settings))
+        return
     regressor = chosen_regressor(settings.regressor)
     load = partial(load_engine, settings.model, settings.provider, regressor, settings.runtime_options)
     run(settings, load, draw_lanes)
+
+
+@cli.command()
+@click.argument("name")
+def key(name: str) -> None:
+    """Make an API key for the caller NAME.
+
+    The service is told its hash alone: the key itself is printed once, and kept nowhere.
+    """
+    token, made = new_key(name)
+    click.echo(f"key:      {token}")
+    click.echo(f"setting:  {made}")
+    click.echo("The caller gets the key. The setting goes to LANESTREAM_API_KEYS, or to the keys file.", err=True)
 
 
 def main() -> None:

@@ -1,27 +1,74 @@
-"""What can be set about the service: by environment variables with the prefix LANESTREAM_, or on the command line."""
+"""What can be set about the service: on the command line, by environment variables LANESTREAM_..., or in a TOML file.
+
+Of what is set in more than one place the command line counts first, then the environment, then the file.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import re
+import tomllib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
-from pydantic import Field, SecretStr, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BeforeValidator, Field, SecretStr, ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
 
 from lanestream.errors import SettingsError
 from lanestream.imaging import MOST_PIXELS, ImageLimits
+from lanestream.keys import ApiKey, parse_keys
 from lanestream.processors import processors
 from lanestream.runtime import Provider, RuntimeOptions
 from lanestream.sessions.manager import SessionLimits
 from lanestream.sessions.stream_rules import StreamLimits
 
-_PREFIX = "LANESTREAM_"
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+_PREFIX: Final = "LANESTREAM_"
+_ORIGIN: Final = re.compile(r"[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
+_MASK: Final = "***"
+# Where a URL may have a password: before its host, or among its parameters.
+_URL_SECRETS: Final = re.compile(r"(?<=://)[^/\s]+(?=@)|(?<=\?).+")
+
+
+def _keys(value: object) -> object:
+    """The keys in a text of them, separated by commas or lines, or in a list of such texts."""
+    return parse_keys(_texts(value), "entry") if value else ()
+
+
+def _origins(value: object) -> object:
+    """The origins in a text of them, separated by commas or lines, or in a list of such texts."""
+    origins = tuple(text.lower() for text in _texts(value) if text)
+    for origin in origins:
+        if not _ORIGIN.fullmatch(origin):
+            raise ValueError(f"{origin!r} is no origin; scheme://host or scheme://host:port is accepted")
+    return origins
+
+
+def _texts(value: object) -> list[str]:
+    given = value if isinstance(value, list | tuple) else [value]
+    texts = [text for text in given if isinstance(text, str)]
+    if len(texts) < len(given):
+        raise ValueError("a text or a list of texts is accepted")
+    return [part.strip() for text in texts for line in text.splitlines() for part in line.split(",")]
 
 
 class Settings(BaseSettings):
-    """The service's settings; each is read from LANESTREAM_<NAME>."""
+    """The service's settings; each is read from LANESTREAM_<NAME>, or by its name from the file that `config` names."""
 
-    model_config = SettingsConfigDict(env_prefix=_PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(
+        env_prefix=_PREFIX, env_ignore_empty=True, frozen=True, extra="forbid", hide_input_in_errors=True
+    )
+
+    config: Path | None = Field(default=None, description="TOML file with settings; it can't name another one.")
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
@@ -62,6 +109,33 @@ class Settings(BaseSettings):
     )
     opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV takes for one image.")
 
+    api_keys: Annotated[tuple[ApiKey, ...], NoDecode, BeforeValidator(_keys)] = Field(
+        default=(), description="API keys as `lanestream key NAME` prints them, NAME:SHA256; without any, all may come."
+    )
+    api_keys_file: Path | None = Field(default=None, description="File with more of them, one a line.")
+    allowed_origins: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)] = Field(
+        default=(), description="Origins of web pages that may use the service, beside its own: https://example.com."
+    )
+    metrics_access: Literal["keys", "open", "off"] = Field(
+        default="keys", description="Who may read /metrics: those with a key, everybody, nobody."
+    )
+    log_format: Literal["text", "json"] = Field(default="text", description="Form of a line in the log.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="The least that is logged."
+    )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
+        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Where settings come from, the first counts."""
+        return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+
     @property
     def runtime_options(self) -> RuntimeOptions:
         """How the networks run."""
@@ -97,18 +171,90 @@ class Settings(BaseSettings):
 
 
 def load_settings(**given: object) -> Settings:
-    """Settings from the environment, where not `given` (None counts as not given).
+    """Settings as `given` on the command line (None counts as not given), else from the environment, else from a file.
 
-    Raises SettingsError with one line that names the variable or option.
+    The file is the one that the setting `config` names. Raises SettingsError with one line that names the option, the
+    variable or the key in the file, and shows no secret.
     """
-    chosen = {name: value for name, value in given.items() if value is not None}
+    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    named = chosen.get("config") or os.environ.get(f"{_PREFIX}CONFIG")
+    path = None if named is None or named == "" else Path(str(named))
+    keys = {} if path is None else _read(path)
+
+    class Configured(Settings):
+        """The settings, with this file behind them."""
+
+        model_config = SettingsConfigDict(toml_file=path)
+
     try:
-        return Settings(**chosen)  # type: ignore[arg-type]
+        return Configured(**chosen)
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         name = str(problem["loc"][0])
-        label = f"--{name.replace('_', '-')}" if name in chosen else _PREFIX + name.upper()
-        raise SettingsError(f"{label} = {problem['input']!r}: {_sentence(problem['msg'])}") from None
+        if name in chosen:
+            label = f"--{name.replace('_', '-')}"
+        elif name in keys and not os.environ.get(_PREFIX + name.upper()):
+            label = f"{path}: {name}"
+        else:
+            label = _PREFIX + name.upper()
+        raise _told(label, problem) from None
+
+
+def shown(settings: Settings) -> str:
+    """The settings as a TOML file, one a line, without the secrets in them; what is not set is a comment."""
+    lines = (_line(name, getattr(settings, name)) for name in type(settings).model_fields)
+    return "\n".join(lines)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The keys and values of a TOML file. Raises SettingsError where it is none."""
+    try:
+        with path.open("rb") as file:
+            values = tomllib.load(file)
+    except OSError as error:
+        raise SettingsError(
+            f"can't read {path}: {(error.strerror or str(error)).lower()}", "see --config and LANESTREAM_CONFIG"
+        ) from None
+    except UnicodeDecodeError:
+        raise SettingsError(f"{path} is no text", "give a TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(
+            f"{path} is no TOML: {_sentence(str(error))}", 'write a setting as `name = "value"`'
+        ) from None
+    if "config" in values:
+        raise SettingsError(f"{path}: config can't be set in the file", "give one file, with --config")
+    return values
+
+
+def _told(label: str, problem: ErrorDetails) -> SettingsError:
+    if problem["type"] == "extra_forbidden":
+        return SettingsError(f"{label} is no setting", "`lanestream serve --print-config` prints all there are")
+    message = _sentence(problem["msg"].removeprefix("Value error, "))
+    return SettingsError(f"{label}{_value(problem)}: {message}")
+
+
+def _value(problem: ErrorDetails) -> str:
+    """What was given, where it may be seen."""
+    annotation = Settings.model_fields[str(problem["loc"][0])].annotation
+    secret = {annotation, *get_args(annotation)} & {SecretStr, ApiKey}
+    return "" if secret else f" = {problem['input']!r}"
+
+
+def _line(name: str, value: object) -> str:
+    if value is None:
+        return f"# {name} is not set"
+    return f"{name} = {json.dumps(_plain(value), ensure_ascii=False)}"
+
+
+def _plain(value: object) -> object:
+    """A value as TOML and JSON both write it, without its secrets."""
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, ApiKey):
+        return f"{value.name}:{_MASK}"
+    if isinstance(value, SecretStr):
+        return _URL_SECRETS.sub(_MASK, value.get_secret_value())
+    return str(value) if isinstance(value, Path) else value
 
 
 def _sentence(message: str) -> str:

@@ -7,15 +7,18 @@ from contextlib import asynccontextmanager
 from http import HTTPStatus
 from typing import TYPE_CHECKING
 
-from fastapi import FastAPI, Request
+from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.security import HTTPBearer
 from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
 
 from lanestream import __version__
 from lanestream.api import rest, stream
+from lanestream.api.problems import Problem, problem_of, problem_response
 from lanestream.api.service import Draw, Service
-from lanestream.errors import LanestreamError, ProtocolError, answer_to
+from lanestream.errors import LanestreamError, ProtocolError
 from lanestream.protocol import error_message
 
 if TYPE_CHECKING:
@@ -27,7 +30,8 @@ def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = No
     """The application around a warm `engine`.
 
     Without an engine it lives but is not ready until `app.state.service.install(engine)`. `draw` paints the lanes of a
-    message on a BGR image (H, W, 3) uint8; without it pictures are refused.
+    message on a BGR image (H, W, 3) uint8; without it pictures are refused. Raises SettingsError where the file of API
+    keys can't be used.
     """
     service = Service(settings, draw)
     if engine is not None:
@@ -45,8 +49,14 @@ def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = No
         lifespan=life,
     )
     app.state.service = service
-    app.include_router(rest.router)
-    app.include_router(stream.router)
+    _include_routes(app, settings, with_keys=bool(service.gatekeeper.keys))
+    if settings.allowed_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.allowed_origins,
+            allow_methods=("GET", "POST"),
+            allow_headers=("Authorization",),
+        )
     app.add_exception_handler(LanestreamError, _tell)
     app.add_exception_handler(RequestValidationError, _tell_invalid)
     app.add_exception_handler(HTTPException, _tell_http)
@@ -54,10 +64,23 @@ def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = No
     return app
 
 
+def _include_routes(app: FastAPI, settings: Settings, *, with_keys: bool) -> None:
+    """Adds the routes, those that are not for everybody behind the gatekeeper."""
+    guard = [Depends(rest.admitted)]
+    if with_keys:
+        guard.append(Depends(HTTPBearer(auto_error=False, description="An API key, as `lanestream key` makes them.")))
+    app.include_router(rest.open_router)
+    app.include_router(rest.router, dependencies=guard, responses=rest.REFUSALS)
+    if settings.metrics_access == "keys":
+        app.include_router(rest.metrics_router, dependencies=guard, responses=rest.REFUSALS)
+    elif settings.metrics_access == "open":
+        app.include_router(rest.metrics_router)
+    app.include_router(stream.router)
+
+
 async def _tell(request: Request, error: Exception) -> JSONResponse:
-    told = error_message(error)
-    request.app.state.service.metrics.refused(told.code)
-    return _answer(answer_to(error).http_status, told.code, told.message, told.hint)
+    request.app.state.service.metrics.refused(error_message(error).code)
+    return problem_of(error)
 
 
 async def _tell_invalid(request: Request, error: Exception) -> JSONResponse:
@@ -70,12 +93,8 @@ async def _tell_invalid(request: Request, error: Exception) -> JSONResponse:
 async def _tell_http(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)  # noqa: S101  (this is the class it is registered for)
     code = HTTPStatus(error.status_code).name.lower()
-    answer = _answer(error.status_code, code, f"{request.method} {request.url.path}: {error.detail}", "see /docs")
+    # The path as it came: what `request.url` reads can be bent by the Host header.
+    message = f"{request.method} {request.scope['path']}: {error.detail}"
+    answer = problem_response(error.status_code, Problem(code=code, message=message, hint="see /docs"))
     answer.headers.update(error.headers or {})
     return answer
-
-
-def _answer(status: int, code: str, message: str, hint: str) -> JSONResponse:
-    # What is left of a body that is too large will not be read.
-    headers = {"connection": "close"} if status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE else None
-    return JSONResponse({"code": code, "message": message, "hint": hint}, status, headers)

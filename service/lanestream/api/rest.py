@@ -15,6 +15,7 @@ from starlette.requests import ClientDisconnect
 
 from lanestream.api.accept import preferred
 from lanestream.api.metrics import MEDIA_TYPE
+from lanestream.api.problems import Problem
 from lanestream.api.service import Service
 from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
 from lanestream.messages import lanes_message
@@ -29,7 +30,12 @@ if TYPE_CHECKING:
     from lanestream.messages import ProcessedFrame
     from lanestream.sessions.manager import OpenSession
 
+# For everybody: whether the service lives, and what its own repository tells as well.
+open_router = APIRouter()
+# For those whom the gatekeeper lets in.
 router = APIRouter()
+# For those whom the setting `metrics_access` names.
+metrics_router = APIRouter()
 
 _JSON: Final = "application/json"
 _PICTURES: Final = {"image/jpeg": ".jpg", "image/png": ".png"}
@@ -72,14 +78,6 @@ class Readiness(BaseModel):
     networks: list[NetworkEntry]
 
 
-class Problem(BaseModel):
-    """What every refused request is answered with."""
-
-    code: str
-    message: str
-    hint: str
-
-
 _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     406: {"model": Problem, "description": "No answer in the form that was asked for"},
     413: {"model": Problem, "description": "More bytes or pixels than are accepted"},
@@ -87,6 +85,15 @@ _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     422: {"model": Problem, "description": "A malformed request, or a detector that is not loaded"},
     503: {"model": Problem, "description": "Not ready yet, or at the session limit"},
 }
+REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
+    401: {"model": Problem, "description": "No API key, or a wrong one"},
+    403: {"model": Problem, "description": "A web page of an origin that may not"},
+}
+
+
+async def admitted(request: Request) -> Caller:
+    """Who asks. Raises UnauthorizedError or ForbiddenError where they may not."""
+    return _service(request).gatekeeper.admit(request)
 
 
 def _camera(
@@ -117,6 +124,7 @@ def _camera(
 )
 async def detect(
     request: Request,
+    caller: Annotated[Caller, Depends(admitted)],
     camera: Annotated[CameraModel | None, Depends(_camera)],
     horizon: Annotated[
         float | None, Query(gt=0.0, lt=1.0, description="Row of the horizon as a share of the image height.")
@@ -130,8 +138,7 @@ async def detect(
     service.check_open()
     loaded = service.loaded
     form = _answer_form(request, service.draw)
-    host = request.client.host if request.client else "unknown"
-    with service.sessions.opened(loaded.engine, Caller("anonymous", host), horizon, detector) as opened:
+    with service.sessions.opened(loaded.engine, caller, horizon, detector) as opened:
         data = await _image_bytes(request, service.settings.image_limits)
         frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic()))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
@@ -148,19 +155,19 @@ async def models(request: Request) -> ModelList:
     return ModelList(models=[ModelEntry.of(each, metadata=dict(each.network.metadata)) for each in pipelines])
 
 
-@router.get("/v1/schema")
+@open_router.get("/v1/schema")
 async def schema() -> dict[str, dict[str, Any]]:
     """JSON Schemas of the messages of `/v1/stream`: what a client sends, and what the service sends."""
     return schemas()
 
 
-@router.get("/healthz")
+@open_router.get("/healthz")
 async def healthz() -> dict[str, str]:
     """Answers while the process lives."""
     return {"status": "alive"}
 
 
-@router.get("/readyz", responses={503: _PROBLEMS[503]})
+@open_router.get("/readyz", responses={503: _PROBLEMS[503]})
 async def readyz(request: Request) -> Readiness:
     """Answers once the networks are loaded and warm, until the service is about to stop."""
     _service(request).check_open()
@@ -168,7 +175,7 @@ async def readyz(request: Request) -> Readiness:
     return Readiness(status="ready", provider=networks[0].provider, networks=networks)
 
 
-@router.get("/metrics", response_class=Response, responses={200: {"content": {MEDIA_TYPE: {}}}})
+@metrics_router.get("/metrics", response_class=Response, responses={200: {"content": {MEDIA_TYPE: {}}}})
 async def metrics(request: Request) -> Response:
     """Counters and histograms in Prometheus' text format."""
     return Response(_service(request).metrics.exposition(), headers={"content-type": MEDIA_TYPE})

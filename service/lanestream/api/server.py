@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import copy
 import errno
+import ipaddress
 import logging
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import uvicorn
-from uvicorn.config import LOGGING_CONFIG
 
+from lanestream.api.access import warn_if_open
 from lanestream.api.app import create_app
 from lanestream.errors import SettingsError
+from lanestream.logs import log_config
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -63,7 +64,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         # What is somewhat too large gets an error of its own; what is far too large costs the socket, not the session.
         ws_max_size=2 * settings.max_bytes,
         ws_per_message_deflate=False,
-        log_config=_log_config(),
+        log_config=log_config(settings),
     )
 
 
@@ -83,6 +84,7 @@ class Server(uvicorn.Server):
 async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     host, port = listener.getsockname()[:2]
+    warn_if_open(app.state.service.gatekeeper, host, loopback=ipaddress.ip_address(host).is_loopback)
     _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
     try:
         engine = await asyncio.to_thread(load)
@@ -95,9 +97,3 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
         await serving
         raise
     await serving
-
-
-def _log_config() -> dict[str, Any]:
-    config = copy.deepcopy(LOGGING_CONFIG)
-    config["loggers"]["lanestream"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
-    return config

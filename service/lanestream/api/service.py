@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from lanestream.api.access import Gatekeeper
 from lanestream.api.metrics import Metrics
 from lanestream.errors import DrainingError, NotReadyError
 from lanestream.protocol import Limits
@@ -44,6 +45,7 @@ class Service:
     def __init__(self, settings: Settings, draw: Draw | None = None) -> None:
         self.settings = settings
         self.draw = draw
+        self.gatekeeper = Gatekeeper.of(settings)
         self.metrics = Metrics()
         self.streams: set[StreamHandler] = set()
         self.draining = False

@@ -12,8 +12,8 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
-from fastapi.responses import JSONResponse
 
+from lanestream.api.problems import deny
 from lanestream.errors import (
     EvictedError,
     ExpiredError,
@@ -35,7 +35,6 @@ from lanestream.protocol import (
     error_message,
     parse_client_message,
 )
-from lanestream.sessions.caller import Caller
 from lanestream.sessions.runner import EncodedFrame
 from lanestream.sessions.stream_rules import Outcome, StreamRules, check_age
 
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     from lanestream.api.service import Service
     from lanestream.detection import Pipeline
     from lanestream.messages import ProcessedFrame
+    from lanestream.sessions.caller import Caller
     from lanestream.sessions.manager import OpenSession
     from lanestream.sessions.stream_rules import IncomingFrame
 
@@ -60,20 +60,14 @@ async def stream(socket: WebSocket) -> None:
     """One stream of frames, from the handshake to the close."""
     service: Service = socket.app.state.service
     try:
+        caller = service.gatekeeper.admit(socket)
         service.check_open()
     except LanestreamError as error:
-        await _refuse(socket, error)
+        await deny(socket, error)
         return
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
-    await StreamHandler(socket, service, Caller("anonymous", "anonymous")).run()
-
-
-async def _refuse(socket: WebSocket, error: LanestreamError) -> None:
-    """Answers the handshake with what an HTTP request would be answered with."""
-    told = error_message(error)
-    body = {"code": told.code, "message": told.message, "hint": told.hint}
-    await socket.send_denial_response(JSONResponse(body, answer_to(error).http_status))
+    await StreamHandler(socket, service, caller).run()
 
 
 class StreamHandler:
@@ -181,7 +175,8 @@ class StreamHandler:
         options = self._rules.options
         detector = self._service.loaded.engine.pipeline(options.detector).name
         how = "resumed" if opened.resumption == "resumed" else "opened"
-        _log.info("stream %s, mode %s, detector %s", how, options.mode, detector, extra=self._named())
+        told = (how, self._caller.identity, options.mode, detector)
+        _log.info("stream %s by %s, mode %s, detector %s", *told, extra=self._named())
 
     def _ready(self, opened: OpenSession, pipeline: Pipeline) -> ReadyMessage:
         return ReadyMessage(

@@ -1,0 +1,311 @@
+"""Who may come in, over real sockets: keys, origins, and what stays open."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import fakes
+import httpx
+import pytest
+from fastapi.routing import APIRoute
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from lanestream.api import create_app
+from lanestream.api.access import Gatekeeper, warn_if_open
+from lanestream.errors import SettingsError
+from lanestream.keys import ApiKey, new_key
+from lanestream.settings import Settings
+
+Serve = Callable[..., str]
+
+TOKEN, KEY = new_key("camera-7")
+OTHER_TOKEN, OTHER_KEY = new_key("camera-8")
+FOREIGN = "https://evil.example"
+LISTED = "https://lanes.example.com"
+OPEN_PATHS = {"/healthz", "/readyz", "/v1/schema"}
+
+
+@pytest.fixture
+def guarded(serve: Serve) -> str:
+    """A service that asks for one of two keys."""
+    return serve(fakes.engine(), api_keys=f"{KEY},{OTHER_KEY}", allowed_origins=LISTED)
+
+
+def bearer(token: str, scheme: str = "Bearer") -> dict[str, str]:
+    return {"authorization": f"{scheme} {token}"}
+
+
+def shaken(url: str, **how: Any) -> str | None:
+    """The subprotocol that was agreed on, after a frame was answered. Raises InvalidStatus where we were refused."""
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None, **how) as socket:
+        socket.send(fakes.image_file())
+        assert json.loads(socket.recv(fakes.WAIT_S))["type"] == "lanes"
+        return socket.subprotocol
+
+
+def refused(url: str, **how: Any) -> tuple[int, str, str | None]:
+    """Status, code and challenge of a handshake that was refused."""
+    with pytest.raises(InvalidStatus) as caught:
+        shaken(url, **how)
+    response = caught.value.response
+    told = json.loads(response.body)
+    assert set(told) == {"code", "message", "hint"}
+    return response.status_code, told["code"], response.headers.get("www-authenticate")
+
+
+@pytest.mark.parametrize("token", [TOKEN, OTHER_TOKEN], ids=["one", "other"])
+def test_a_key_opens_requests_and_streams(guarded: str, token: str) -> None:
+    for headers in (bearer(token), bearer(token, "bearer"), bearer(f" {token}")):
+        assert httpx.post(f"{guarded}/v1/detect", content=fakes.image_file(), headers=headers).status_code == 200
+        assert shaken(guarded, additional_headers=headers) is None
+        assert shaken(guarded, additional_headers=headers, subprotocols=["lanestream.v1"]) == "lanestream.v1"
+
+
+def test_a_browser_offers_the_key_as_a_subprotocol_and_never_gets_it_back(guarded: str) -> None:
+    key = f"bearer.{TOKEN}"
+    assert shaken(guarded, subprotocols=["lanestream.v1", key]) == "lanestream.v1"
+    assert shaken(guarded, subprotocols=[key, "lanestream.v1"]) == "lanestream.v1"
+    assert shaken(guarded, subprotocols=[key]) is None
+
+
+WRONG = [
+    {},
+    {"authorization": "Bearer"},
+    {"authorization": TOKEN},
+    bearer(TOKEN[:-1]),
+    bearer(TOKEN + "x"),
+    bearer(KEY.digest),
+    bearer(str(KEY)),
+    bearer(TOKEN, "Basic"),
+]
+
+
+@pytest.mark.parametrize("headers", WRONG, ids=range(len(WRONG)))
+def test_without_a_right_key_nobody_comes_in(guarded: str, headers: dict[str, str]) -> None:
+    response = httpx.post(f"{guarded}/v1/detect?key={TOKEN}&horizon=9", content=b"no image", headers=headers)
+    assert (response.status_code, response.json()["code"]) == (401, "unauthorized")
+    assert response.headers["www-authenticate"] == "Bearer"
+    assert refused(guarded, additional_headers=headers) == (401, "unauthorized", "Bearer")
+
+
+@pytest.mark.parametrize(
+    "offered", ["bearer.", f"bearer.{TOKEN}x", TOKEN, f"Bearer.{TOKEN}"], ids=["empty", "longer", "bare", "upper case"]
+)
+def test_a_wrong_subprotocol_is_no_key(guarded: str, offered: str) -> None:
+    assert refused(guarded, subprotocols=["lanestream.v1", offered])[:2] == (401, "unauthorized")
+
+
+def test_a_wrong_header_is_not_made_good_by_a_subprotocol(guarded: str) -> None:
+    assert refused(guarded, additional_headers=bearer("x"), subprotocols=[f"bearer.{TOKEN}"])[0] == 401
+
+
+def test_every_route_is_guarded_but_those_for_everybody() -> None:
+    app = create_app(fakes.engine(), Settings(api_keys=str(KEY)))
+    described = app.openapi()
+    assert described["components"]["securitySchemes"]["HTTPBearer"]["scheme"] == "bearer"
+    guarded = {path for path, told in described["paths"].items() if all("security" in each for each in told.values())}
+    assert set(described["paths"]) - guarded == OPEN_PATHS
+    assert {"/v1/detect", "/v1/models", "/metrics"} <= guarded
+    assert all(isinstance(route, APIRoute) for route in app.routes if getattr(route, "path", "") in guarded)
+    without_keys = create_app(fakes.engine(), Settings()).openapi()
+    assert "securitySchemes" not in without_keys["components"]
+
+
+def test_what_is_described_as_guarded_is(guarded: str) -> None:
+    for path, methods in httpx.get(f"{guarded}/openapi.json").json()["paths"].items():
+        for method in methods:
+            status = httpx.request(method, f"{guarded}{path}").status_code
+            assert (status == 200) == (path in OPEN_PATHS), path
+            assert status in (200, 401), path
+    assert httpx.get(f"{guarded}/docs").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "path", ["/v1/models/", "//v1/models", "/v1/./models", "/v1%2fmodels", "/healthz/../v1/models"]
+)
+def test_no_spelling_of_a_path_slips_past(guarded: str, path: str) -> None:
+    port = int(guarded.rpartition(":")[2])
+    with httpx.Client() as client:
+        for host in (f"127.0.0.1:{port}", "x/healthz?", "x/healthz#"):
+            request = client.build_request("GET", guarded, headers={"host": host})
+            request.url = request.url.copy_with(raw_path=path.encode())
+            assert client.send(request, follow_redirects=False).status_code in (307, 400, 401, 404)
+
+
+@pytest.mark.parametrize("keys", [None, str(KEY)], ids=["no keys", "keys"])
+def test_a_page_of_a_foreign_origin_is_refused_before_the_handshake(serve: Serve, keys: str | None) -> None:
+    url = serve(fakes.engine(), allowed_origins=LISTED, **({"api_keys": keys} if keys else {}))
+    port = url.rpartition(":")[2]
+    how: dict[str, Any] = {"additional_headers": bearer(TOKEN)}
+    foreign = (
+        FOREIGN,
+        "null",
+        "file://",
+        "http://127.0.0.1",
+        f"http://localhost:{port}",
+        f"{LISTED}:8443",
+        f"{LISTED}.x",
+    )
+    for origin in foreign:
+        assert refused(url, origin=origin, **how) == (403, "forbidden", None)
+    for origin in (LISTED, url, url.replace("http", "https")):
+        shaken(url, origin=origin, **how)
+    response = httpx.post(f"{url}/v1/detect", content=fakes.image_file(), headers={**bearer(TOKEN), "origin": FOREIGN})
+    assert (response.status_code, response.json()["code"]) == (403, "forbidden")
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        ("lanes.test", "https://lanes.test", 200),
+        ("lanes.test:443", "https://lanes.test", 200),
+        ("LANES.test", "http://lanes.test:80", 200),
+        ("[::1]:8000", "http://[::1]:8000", 200),
+        ("lanes.test", "https://lanes.test:8443", 403),
+        ("lanes.test:80", "https://lanes.test", 403),
+        ("lanes.test", "http://[lanes.test", 403),
+        ("lanes.test", "http://lanes.test:x", 403),
+        ("", "null", 403),
+        ("", "http://", 403),
+    ],
+)
+def test_our_own_pages_are_told_by_host_and_port(url: str, host: str, origin: str, status: int) -> None:
+    assert httpx.get(f"{url}/v1/models", headers={"host": host, "origin": origin}).status_code == status
+
+
+def test_pages_of_listed_origins_may_read_answers(guarded: str) -> None:
+    asked = {"access-control-request-method": "POST", "access-control-request-headers": "authorization"}
+    for origin, allowed in ((LISTED, LISTED), (FOREIGN, None)):
+        headers = {"origin": origin, **bearer(TOKEN)}
+        answers = [
+            httpx.options(f"{guarded}/v1/detect", headers={**asked, "origin": origin}),
+            httpx.post(f"{guarded}/v1/detect", content=fakes.image_file(), headers=headers),
+            httpx.get(f"{guarded}/v1/models", headers={"origin": origin}),
+        ]
+        for answer in answers:
+            assert answer.headers.get("access-control-allow-origin") == allowed
+            assert "access-control-allow-credentials" not in answer.headers
+        assert [answer.status_code for answer in answers] == ([200, 200, 401] if allowed else [400, 403, 403])
+
+
+@pytest.mark.parametrize(("access", "without", "within"), [("keys", 401, 200), ("open", 200, 200), ("off", 404, 404)])
+def test_metrics_have_a_rule_of_their_own(serve: Serve, access: str, without: int, within: int) -> None:
+    url = serve(fakes.engine(), api_keys=str(KEY), metrics_access=access)
+    assert httpx.get(f"{url}/metrics").status_code == without
+    assert httpx.get(f"{url}/metrics", headers=bearer(TOKEN)).status_code == within
+
+
+def test_refusals_are_counted(guarded: str) -> None:
+    httpx.get(f"{guarded}/v1/models")
+    refused(guarded)
+    refused(guarded, origin=FOREIGN)
+    told = httpx.get(f"{guarded}/metrics", headers=bearer(TOKEN)).text
+    assert 'lane_refusals_total{code="unauthorized"} 2.0' in told
+    assert 'lane_refusals_total{code="forbidden"} 1.0' in told
+
+
+def test_keys_come_from_a_file_too(serve: Serve, tmp_path: Path) -> None:
+    (tmp_path / "keys").write_text(f"# cameras\n{KEY}\n")
+    url = serve(fakes.engine(), api_keys=str(OTHER_KEY), api_keys_file=tmp_path / "keys")
+    for token in (TOKEN, OTHER_TOKEN):
+        assert httpx.get(f"{url}/v1/models", headers=bearer(token)).status_code == 200
+    (tmp_path / "keys").write_text("camera-7: what?\n")
+    with pytest.raises(SettingsError, match="line 1 is no key"):
+        create_app(None, Settings(api_keys_file=tmp_path / "keys"))
+
+
+def test_the_command_makes_keys_that_open(serve: Serve) -> None:
+    made = subprocess.run(
+        [sys.executable, "-m", "lanestream.cli", "key", "camera-9"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=30,
+    )
+    told = dict(line.split(": ", 1) for line in made.stdout.splitlines())
+    token, setting = told["key"].strip(), told["setting"].strip()
+    assert setting.startswith("camera-9:")
+    assert token not in setting
+    url = serve(fakes.engine(), api_keys=setting)
+    assert httpx.get(f"{url}/v1/models", headers=bearer(token)).status_code == 200
+
+
+def _with_key(token: str, *, in_header: bool) -> dict[str, Any]:
+    return (
+        {"additional_headers": bearer(token)} if in_header else {"subprotocols": ["lanestream.v1", f"bearer.{token}"]}
+    )
+
+
+def log_of(arguments: list[str], settings: dict[str, str], use: Callable[[str], None]) -> list[str]:
+    """The lines that `lanestream serve` logs while it is used."""
+    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu", *arguments]
+    environment = {**os.environ, **settings}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stderr is not None
+        lines: list[str] = []
+        try:
+            for line in process.stderr:
+                lines.append(line)
+                if "listening on" in line:
+                    url = line.split("listening on ")[1].split(",")[0]
+                if '"ready"' in line or line.endswith(": ready\n"):
+                    break
+            use(url.replace("0.0.0.0", "127.0.0.1"))  # noqa: S104
+            process.send_signal(signal.SIGINT)
+            output, errors = process.communicate(timeout=fakes.WAIT_S)
+        finally:
+            process.kill()
+    assert output == ""
+    return [*lines, *errors.splitlines(keepends=True)]
+
+
+def test_no_key_gets_into_the_log() -> None:
+    wrong = "lane_a-key-that-is-not-known"
+
+    def use(url: str) -> None:
+        for token in (TOKEN, wrong):
+            httpx.get(f"{url}/v1/models?key={token}", headers=bearer(token))
+        for in_header in (True, False):
+            shaken(url, **_with_key(TOKEN, in_header=in_header))
+            assert refused(url, **_with_key(wrong, in_header=in_header))[0] == 401
+        with pytest.raises(InvalidStatus), connect(f"{url.replace('http', 'ws')}/v1/stream?key={TOKEN}"):
+            pass
+
+    lines = log_of(["--log-format", "json", "--log-level", "debug"], {"LANESTREAM_API_KEYS": str(KEY)}, use)
+    records = [json.loads(line) for line in lines]
+    assert all({"time", "level", "logger", "message"} <= set(record) for record in records)
+    assert {record["logger"] for record in records} >= {"lanestream.api.server", "uvicorn.access", "uvicorn.error"}
+    assert not [record for record in records if record["level"] in ("WARNING", "ERROR")]
+    messages = "\n".join(record["message"] for record in records)
+    assert '"GET /v1/models HTTP/1.1" 401' in messages
+    assert '"WebSocket /v1/stream" 401' in messages
+    assert "camera-7" in messages
+    for secret in (TOKEN, KEY.digest, wrong):
+        assert secret not in "".join(lines)
+
+
+def test_a_service_for_everybody_says_so_loudly() -> None:
+    lines = log_of(["--host", "0.0.0.0"], {}, lambda url: None)  # noqa: S104
+    (warning,) = [line for line in lines if " WARNING " in line]
+    assert "NO API KEYS: everybody who can reach 0.0.0.0 may use this service" in warning
+    assert "lanestream key NAME" in warning
+
+
+@pytest.mark.parametrize(("keys", "loopback"), [((KEY,), False), ((KEY,), True), ((), True)], ids=range(3))
+def test_a_service_with_keys_or_for_this_machine_alone_does_not(
+    caplog: pytest.LogCaptureFixture, keys: tuple[ApiKey, ...], loopback: bool
+) -> None:
+    warn_if_open(Gatekeeper(keys), "a host", loopback=loopback)
+    assert not caplog.records
+    warn_if_open(Gatekeeper(), "a host", loopback=False)
+    assert len(caplog.records) == 1
