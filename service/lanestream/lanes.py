@@ -32,8 +32,7 @@ class Curve:
     @classmethod
     def through(cls, horizon: float, rows: FloatArray, columns: FloatArray) -> Curve:
         """The curve through three points at three different rows (3,) below `horizon`."""
-        v, b, k = np.linalg.solve(curve_basis(horizon, rows), columns)
-        return cls(horizon, (float(v), float(b), float(k)))
+        return curves_through(horizon, rows, columns[None])[0]
 
     def x(self, y: FloatArray | float) -> FloatArray:
         """Columns at the rows `y`; the shape of the answer is that of `y`."""
@@ -51,6 +50,12 @@ def curve_basis(horizon: float, rows: FloatArray) -> FloatArray:
     """d x / d (v, b, k) at `rows` (N,): shape (N, 3)."""
     u = _depth(horizon, rows)
     return np.stack([np.ones_like(u), u, 1.0 / u], axis=-1)
+
+
+def curves_through(horizon: float, rows: FloatArray, columns: FloatArray) -> list[Curve]:
+    """The curve through each row of `columns` (N, 3), which they have at the same three `rows` (3,) below `horizon`."""
+    coefficients = np.linalg.solve(curve_basis(horizon, rows), columns.T).T.tolist()
+    return [Curve(horizon, (v, b, k)) for v, b, k in coefficients]
 
 
 def curve_columns(curves: Sequence[Curve], rows: FloatArray) -> FloatArray:

@@ -14,8 +14,8 @@ from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
 from lanestream.detection.prior import RoadPrior
 from lanestream.detection.refinement import USUAL_LEANING, Refinement
 from lanestream.detection.strips import StripCutter
-from lanestream.geometry import RoadView, visible_rows
-from lanestream.lanes import Candidate, Curve, Detection, FloatArray, Image
+from lanestream.geometry import RoadView, visible_spans
+from lanestream.lanes import Candidate, Curve, Detection, FloatArray, Image, curve_columns, curves_through
 
 TRUE_LANE = 1
 
@@ -59,51 +59,64 @@ class CandidateDetector:
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
         """Detections from the classifier's probabilities (N, 2) for the patches of `prepare`, left to right."""
         probability = outputs[:, TRUE_LANE]
-        accepted = [int(i) for i in np.argsort(-probability, kind="stable") if probability[i] >= self.threshold]
-        chosen = self._different(accepted, prepared)
-        together = [self._together(index, accepted, prepared, probability) for index in chosen]
+        order = np.argsort(-probability, kind="stable")
+        accepted = order[probability[order] >= self.threshold]
+        candidates = [prepared.candidates[i] for i in accepted]
+        if not candidates:
+            return Findings((), prepared.view, prepared.horizon_weight)
+        away = np.abs(_gaps([candidate.curve for candidate in candidates], prepared.view)).max(axis=2)
+        chosen = _kept(away > self.same)
+        together = self._together(candidates, probability[accepted], away, chosen, prepared.view)
         fits = self.refinement.refine(prepared.image, together, prepared.view)
-        detections = []
-        for index, fit in zip(chosen, fits, strict=True):
-            rows = visible_rows(fit.curve, prepared.view, TOP_SHARE)
-            if rows is not None:
-                detections.append(Detection(fit.curve, fit.covariance, *rows, float(probability[index])))
-        apart = sorted(self._apart(detections, prepared.view), key=lambda d: float(d.curve.x(prepared.view.bottom)))
-        return Findings(tuple(apart), prepared.view, prepared.horizon_weight)
-
-    def _different(self, accepted: Sequence[int], prepared: Prepared) -> list[int]:
-        """Of candidates along one marking the most probable: refinement would move them onto each other anyway."""
-        kept: list[int] = []
-        for index in accepted:
-            curve = prepared.candidates[index].curve
-            gaps = [np.abs(_gaps(curve, prepared.candidates[i].curve, prepared.view)).max() for i in kept]
-            if all(gap > self.same for gap in gaps):
-                kept.append(index)
-        return kept
+        spans = visible_spans([fit.curve for fit in fits], prepared.view, TOP_SHARE)
+        detections = [
+            Detection(fit.curve, fit.covariance, *span, float(probability[accepted[i]]))
+            for i, fit, span in zip(chosen, fits, spans, strict=True)
+            if span is not None
+        ]
+        return Findings(tuple(self._apart(detections, prepared.view)), prepared.view, prepared.horizon_weight)
 
     def _together(
-        self, index: int, accepted: Sequence[int], prepared: Prepared, probability: NDArray[np.float32]
-    ) -> Candidate:
-        """The mean of a candidate and the accepted ones like it: each errs in its own way, the less sure ones more."""
-        view, best = prepared.view, prepared.candidates[index]
+        self,
+        candidates: Sequence[Candidate],
+        probability: NDArray[np.float32],
+        away: FloatArray,
+        chosen: Sequence[int],
+        view: RoadView,
+    ) -> list[Candidate]:
+        """Of each chosen candidate the mean with all that are like it: each errs in its own way, the less sure more."""
         rows = view.horizon + np.asarray(_ROWS) * view.depth
-        reach = self.alike * max(1.0, float(np.hypot(1.0, best.curve.slope(rows[1]))) / USUAL_LEANING)
-        alike = [i for i in accepted if np.abs(_gaps(prepared.candidates[i].curve, best.curve, view)).max() <= reach]
-        columns = np.stack([prepared.candidates[i].curve.x(rows) for i in alike])
-        curve = Curve.through(view.horizon, rows, np.average(columns, axis=0, weights=probability[alike] ** 8))
-        return Candidate(curve, *(visible_rows(curve, view, TOP_SHARE) or (best.top, best.bottom)), best.strength)
+        curves = [candidate.curve for candidate in candidates]
+        leaning = np.hypot(1.0, [float(curves[i].slope(rows[1])) for i in chosen]) / USUAL_LEANING
+        alike = away[chosen] <= self.alike * np.maximum(1.0, leaning)[:, None]
+        weights = alike * probability.astype(np.float64) ** 8
+        columns = weights @ curve_columns(curves, rows) / weights.sum(axis=1, keepdims=True)
+        means = curves_through(view.horizon, rows, columns)
+        spans = visible_spans(means, view, TOP_SHARE)
+        return [
+            Candidate(mean, *(span or (candidates[i].top, candidates[i].bottom)), candidates[i].strength)
+            for i, mean, span in zip(chosen, means, spans, strict=True)
+        ]
 
     def _apart(self, detections: Sequence[Detection], view: RoadView) -> list[Detection]:
-        """The detections, most probable first, that keep their distance from all better ones."""
-        kept: list[Detection] = []
-        for detection in detections:
-            gaps = [_gaps(detection.curve, other.curve, view) for other in kept]
-            if all(np.abs(gap).min() > self.separation and (gap > 0.0).all() == (gap > 0.0).any() for gap in gaps):
-                kept.append(detection)
-        return kept
+        """The detections, most probable first, that keep their distance from all better ones; then left to right."""
+        gaps = _gaps([detection.curve for detection in detections], view)
+        on_one_side = (gaps > 0.0).all(axis=2) | (gaps < 0.0).all(axis=2)
+        kept = _kept(on_one_side & (np.abs(gaps).min(axis=2) > self.separation))
+        return sorted((detections[i] for i in kept), key=lambda d: float(d.curve.x(view.bottom)))
 
 
-def _gaps(one: Curve, other: Curve, view: RoadView) -> FloatArray:
-    """How far apart two curves are at three depths, in rows below the horizon; the sign tells which is on the right."""
+def _kept(apart: NDArray[np.bool_]) -> list[int]:
+    """Places of those, the first ones first, that are `apart` (N, N) from all that are kept before them."""
+    kept: list[int] = []
+    for i, others in enumerate(apart):
+        if others[kept].all():
+            kept.append(i)
+    return kept
+
+
+def _gaps(curves: Sequence[Curve], view: RoadView) -> FloatArray:
+    """How far each curve is right of each other one at three depths, in rows below the horizon (N, N, 3)."""
     rows = np.array([view.row_at(0.25), view.row_at(0.5), view.row_at(1.0)])
-    return (one.x(rows) - other.x(rows)) / (rows - view.horizon)
+    places = curve_columns(curves, rows) / (rows - view.horizon)
+    return places[:, None] - places

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection.edges import paint_grey, resized
 from lanestream.geometry import RoadView, Scaling
-from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis, curve_columns
+from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis, curve_columns, curves_through
 
 # hypot(1, slope) of an ego boundary: half a lane of 3.6 m beside a camera 1.45 m high.
 USUAL_LEANING: Final = 1.6
@@ -118,13 +118,10 @@ class Refinement:
             trusted = basis.swapaxes(1, 2) * (np.minimum(total / 2.0, 1.0) / sigma**2)[:, None]
             normal = prior + trusted @ basis
             shift = np.linalg.solve(normal, trusted @ centre[:, :, None])[:, :, 0]
-        coefficients = (curve_columns(along.curves, anchors) + shift) @ to_curve.T
         # Neighbouring rows share their errors: about four of them are worth one.
         covariances = to_curve @ np.linalg.inv(prior + (normal - prior) / 4.0) @ to_curve.T
-        return [
-            Fit(Curve(view.horizon, (v, b, k)), covariance)
-            for (v, b, k), covariance in zip(coefficients.tolist(), covariances, strict=True)
-        ]
+        curves = curves_through(view.horizon, anchors, curve_columns(along.curves, anchors) + shift)
+        return [Fit(curve, covariance) for curve, covariance in zip(curves, covariances, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lanestream.detection import Findings, Prepared
 from lanestream.detection.edges import resized
 from lanestream.detection.refinement import Refinement
-from lanestream.geometry import CanvasGeometry, RoadView, Scaling, visible_rows
+from lanestream.geometry import CanvasGeometry, RoadView, Scaling, visible_spans
 from lanestream.lanes import Candidate, Curve, Detection, FloatArray, Image
 
 # A boundary is told by its columns at these shares of the depth below the horizon.
@@ -111,8 +111,10 @@ class RegressionDetector:
         height, width = image.shape[:2]
         rows = [share * height for share in HORIZONS] if horizon is None else [horizon]
         looks = tuple(RoadView(width, height, float(np.clip(row, 0.0, 0.85 * height))) for row in rows)
-        canvases = np.stack([self.canvas(image, view) for view in looks])
-        both = np.concatenate([canvases, canvases[:, :, ::-1]])
+        scaling = Scaling(min(1.0, self.detail_width / width))
+        detail = resized(image, scaling)
+        straight = [self._canvas(detail, scaling, view) for view in looks]
+        both = np.stack([*straight, *(cv2.flip(canvas, 1) for canvas in straight)])
         return Prepared(image, both, looks[0], looks=looks)
 
     def read(self, prepared: Prepared, outputs: NDArray[np.float32]) -> tuple[RoadReading, RoadView]:
@@ -125,36 +127,30 @@ class RegressionDetector:
         best = min(range(len(readings)), key=lambda i: readings[i].doubt)
         return readings[best], readings[best].view(prepared.looks[best])
 
-    def canvas(self, image: Image, view: RoadView) -> NDArray[np.uint8]:
-        """The canonical picture (size, size, 3) in RGB of a BGR image seen in `view`."""
-        scaling = Scaling(min(1.0, self.detail_width / view.width))
-        columns, rows = self.geometry.grid(view)
-        detail = resized(image, scaling)
-        canvas = cv2.remap(
-            detail,
-            scaling.to_working(0.0) + (columns * scaling.factor).astype(np.float32),
-            scaling.to_working(0.0) + (rows * scaling.factor).astype(np.float32),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+    def _canvas(self, detail: Image, scaling: Scaling, view: RoadView) -> NDArray[np.uint8]:
+        """The canonical picture (size, size, 3) in RGB of `detail`, the image reduced by `scaling`, seen in `view`."""
+        columns, rows = (scaling.to_working(places).astype(np.float32) for places in self.geometry.grid(view))
+        canvas = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(cv2.cvtColor(canvas, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
         """The boundaries in the network's outputs (2 N, 15), left to right, and the horizon that it saw."""
         reading, view = self.read(prepared, outputs)
-        sides, candidates = [], []
-        for side in (0, 1):
-            curve = reading.curve(side, view)
-            rows = visible_rows(curve, view, _TOP_SHARE)
-            if reading.presence[side] >= self.threshold and rows is not None:
-                sides.append(side)
-                candidates.append(Candidate(curve, *rows, 1.0))
-        fits = self.refinement.refine(prepared.image, candidates, view)
-        detections = []
-        for side, fit in zip(sides, fits, strict=True):
-            rows = visible_rows(fit.curve, view, _TOP_SHARE)
-            if rows is not None:
-                detections.append(Detection(fit.curve, fit.covariance, *rows, float(reading.presence[side])))
+        curves = [reading.curve(side, view) for side in (0, 1)]
+        seen = [
+            (presence, Candidate(curve, *span, 1.0))
+            for presence, curve, span in zip(
+                reading.presence.tolist(), curves, visible_spans(curves, view, _TOP_SHARE), strict=True
+            )
+            if presence >= self.threshold and span is not None
+        ]
+        fits = self.refinement.refine(prepared.image, [candidate for _, candidate in seen], view)
+        spans = visible_spans([fit.curve for fit in fits], view, _TOP_SHARE)
+        detections = [
+            Detection(fit.curve, fit.covariance, *span, presence)
+            for (presence, _), fit, span in zip(seen, fits, spans, strict=True)
+            if span is not None
+        ]
         return Findings(tuple(detections), view, float(reading.presence.max()))
 
 

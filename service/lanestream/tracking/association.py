@@ -23,12 +23,13 @@ def associate(tracks: Sequence[Track], measured: Sequence[tuple[FloatArray, Floa
     """
     if not tracks or not measured:
         return []
-    costs = np.full((len(tracks), len(measured)), np.inf)
-    for i, track in enumerate(tracks):
-        for j, (columns, noise) in enumerate(measured):
-            distance, log_determinant = mahalanobis(track.kalman, columns, noise)
-            if distance <= GATE:
-                costs[i, j] = distance + log_determinant
+    distance, log_determinant = mahalanobis(
+        np.stack([track.columns for track in tracks]),
+        np.stack([track.kalman.P[:3, :3] for track in tracks]),
+        np.stack([columns for columns, _ in measured]),
+        np.stack([noise for _, noise in measured]),
+    )
+    costs = np.where(distance <= GATE, distance + log_determinant, np.inf)
     finite = np.isfinite(costs)
     if not finite.any():
         return []

@@ -9,6 +9,7 @@ unseen. The update is filterpy's, in Joseph form.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -33,14 +34,19 @@ class Rows:
         """The rows at `shares` of the depth of a view, nearest first."""
         return cls(view.horizon, view.horizon + np.asarray(shares) * view.depth)
 
+    @cached_property
+    def _to_coefficients(self) -> FloatArray:
+        """The matrix (3, 3) that takes columns at the rows to a curve's coefficients."""
+        return np.asarray(np.linalg.inv(curve_basis(self.horizon, self.y)))
+
     def curve(self, columns: FloatArray) -> Curve:
         """The boundary with these columns (3,) at the rows."""
-        return Curve.through(self.horizon, self.y, columns)
+        v, b, k = (self._to_coefficients @ columns).tolist()
+        return Curve(self.horizon, (v, b, k))
 
     def covariance_of_curve(self, covariance: FloatArray) -> FloatArray:
         """The covariance (3, 3) of the curve's coefficients from that of the columns."""
-        inverse = np.linalg.inv(curve_basis(self.horizon, self.y))
-        return np.asarray(inverse @ covariance @ inverse.T)
+        return np.asarray(self._to_coefficients @ covariance @ self._to_coefficients.T)
 
     def measured(self, curve: Curve, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Columns (3,) and their covariance (3, 3) of a detected curve and that of its coefficients."""
@@ -49,8 +55,7 @@ class Rows:
 
     def mapped_to(self, other: Rows) -> FloatArray:
         """The matrix (3, 3) that takes columns at these rows to columns at the other ones."""
-        inverse = np.linalg.inv(curve_basis(self.horizon, self.y))
-        return np.asarray(curve_basis(self.horizon, other.y) @ inverse)
+        return np.asarray(curve_basis(self.horizon, other.y) @ self._to_coefficients)
 
 
 def boundary_filter(columns: FloatArray, covariance: FloatArray, speed: FloatArray) -> KalmanFilter:
@@ -62,21 +67,36 @@ def boundary_filter(columns: FloatArray, covariance: FloatArray, speed: FloatArr
     return kalman
 
 
-def predict(kalman: KalmanFilter, seconds: float, acceleration: FloatArray) -> None:
-    """Moves a filter on by `seconds`, with white `acceleration` (3,) in px/s^2 at its rows."""
-    power = np.diag(acceleration**2)
-    kept = float(np.exp(-seconds / _FADING_S))
-    travel = _FADING_S * (1.0 - kept)
-    kalman.F = np.block([[np.eye(3), travel * np.eye(3)], [np.zeros((3, 3)), kept * np.eye(3)]])
-    kalman.Q = np.block(
-        [[seconds**3 / 3.0 * power, seconds**2 / 2.0 * power], [seconds**2 / 2.0 * power, seconds * power]]
-    )
-    kalman.predict()
+@dataclass(frozen=True)
+class Motion:
+    """How boundaries move from one frame to the next: the transition F (6, 6) and the noise Q (6, 6) of a step."""
+
+    transition: FloatArray
+    noise: FloatArray
+
+    @classmethod
+    def over(cls, seconds: float, acceleration: FloatArray) -> Motion:
+        """A step of `seconds`, with white `acceleration` (3,) in px/s^2 at the rows."""
+        kept = float(np.exp(-seconds / _FADING_S))
+        step = np.array([[1.0, _FADING_S * (1.0 - kept)], [0.0, kept]])
+        spread = np.array([[seconds**3 / 3.0, seconds**2 / 2.0], [seconds**2 / 2.0, seconds]])
+        return cls(np.kron(step, np.eye(3)), np.kron(spread, np.diag(acceleration**2)))
+
+    def move(self, kalman: KalmanFilter) -> None:
+        """Moves a filter on by the step."""
+        kalman.predict(F=self.transition, Q=self.noise)
 
 
-def mahalanobis(kalman: KalmanFilter, columns: FloatArray, noise: FloatArray) -> tuple[float, float]:
-    """(squared Mahalanobis distance, log determinant) of the innovation of a measurement with covariance `noise`."""
-    innovation = kalman.P[:3, :3] + noise
-    residual = columns - kalman.x[:3]
+def mahalanobis(
+    columns: FloatArray, covariances: FloatArray, measured: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(squared Mahalanobis distance, log determinant) of the innovation of each of N tracks for each of M measurements.
+
+    `columns` (N, 3) and `covariances` (N, 3, 3) are the tracks', `measured` (M, 3) and `noise` (M, 3, 3) the others;
+    the results are (N, M).
+    """
+    innovation = covariances[:, None] + noise
+    residual = measured - columns[:, None]
     _, log_determinant = np.linalg.slogdet(innovation)
-    return float(residual @ np.linalg.solve(innovation, residual)), float(log_determinant)
+    weighed = np.linalg.solve(innovation, residual[..., None])[..., 0]
+    return np.asarray((residual * weighed).sum(axis=2)), np.asarray(log_determinant)

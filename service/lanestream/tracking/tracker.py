@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lanestream.geometry import RoadView, visible_rows
+from lanestream.geometry import RoadView, visible_spans
 from lanestream.lanes import Curve, Detection, EgoLane, FloatArray, FrameResult, LaneBoundary, LaneChange
 from lanestream.tracking.association import associate, recover
-from lanestream.tracking.filter import Rows, boundary_filter, predict
+from lanestream.tracking.filter import Motion, Rows, boundary_filter
 from lanestream.tracking.positions import LaneWidth, Sides, positions
 from lanestream.tracking.state import TrackerState, TrackState, told_rows
 from lanestream.tracking.track import Track
@@ -147,11 +147,12 @@ class LaneTracker:
         return number * self._width.value * self._scaled(self._settings.shares, view)
 
     def _predict(self, seconds: float, view: RoadView) -> None:
-        acceleration = self._scaled(self._settings.acceleration, view)
+        # Beyond the coasting time a track dies anyway, and a long step would only overflow.
+        step = min(seconds, 2.0 * self._settings.coast_s)
+        motion = Motion.over(step, self._scaled(self._settings.acceleration, view))
         for track in self._tracks:
             track.previous_columns = track.columns.copy()
-            # Beyond the coasting time a track dies anyway, and a long step would only overflow.
-            predict(track.kalman, min(seconds, 2.0 * self._settings.coast_s), acceleration)
+            motion.move(track.kalman)
 
     def _forget(self) -> None:
         """Drops what a gap in the stream has made too old; with nothing left, the stream begins anew."""
@@ -223,10 +224,10 @@ class LaneTracker:
         events = self._changes(tracks, columns, view, lane_width)
         places = positions(tracks, columns, _camera(view), lane_width)
         lanes = []
-        for track, curve, place in zip(tracks, curves, places, strict=True):
-            rows = visible_rows(curve, view, 0.1)
-            if rows is not None and track.track_id is not None:
-                lanes.append(self._boundary(track, place, (max(rows[0], track.top), rows[1])))
+        spans = visible_spans(curves, view, 0.1)
+        for track, curve, place, span in zip(tracks, curves, places, spans, strict=True):
+            if span is not None:
+                lanes.append(self._boundary(track, place, curve, (max(span[0], track.top), span[1])))
         return FrameResult(tuple(lanes), self._ego(tracks, columns, places, view), view.horizon, tuple(events))
 
     def _changes(
@@ -235,7 +236,7 @@ class LaneTracker:
         found = [self._sides.update(t, c, _camera(view), lane_width) for t, c in zip(tracks, columns, strict=True)]
         return [change for change in found if change is not None]
 
-    def _boundary(self, track: Track, place: int, rows: tuple[float, float]) -> LaneBoundary:
+    def _boundary(self, track: Track, place: int, curve: Curve, span: tuple[float, float]) -> LaneBoundary:
         assert self._rows is not None and track.track_id is not None  # noqa: S101, PT018 - a confirmed track
         # A boundary that nobody has seen for a while is less and less sure to be there.
         fade = 1.0 - 0.5 * min(1.0, (self._clock - track.last_hit) / self._settings.coast_s)
@@ -244,10 +245,10 @@ class LaneTracker:
             position=place,
             state="detected" if track.detected else "predicted",
             probability=track.probability * fade,
-            curve=self._rows.curve(track.columns),
+            curve=curve,
             covariance=self._rows.covariance_of_curve(track.kalman.P[:3, :3]),
-            top=rows[0],
-            bottom=rows[1],
+            top=span[0],
+            bottom=span[1],
             age_s=self._clock - track.born,
         )
 
