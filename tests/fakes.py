@@ -100,9 +100,14 @@ def two_detectors() -> Engine:
     return Engine([*engine().pipelines, Pipeline("regression", LeftDetector(), OtherNetwork())])
 
 
+def picture(width: int = 320, height: int = 180) -> Image:
+    """A grey ramp."""
+    return np.tile(np.linspace(30, 220, width).astype(np.uint8)[None, :, None], (height, 1, 3))
+
+
 def image_file(kind: str = ".jpg", width: int = 320, height: int = 180, shade: int | None = None) -> bytes:
     """An image file of a grey ramp, or of one `shade`."""
-    ramp = np.tile(np.linspace(30, 220, width).astype(np.uint8)[None, :, None], (height, 1, 3))
+    ramp = picture(width, height)
     image = ramp if shade is None else np.full_like(ramp, shade)
     return cv2.imencode(kind, image)[1].tobytes()
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanestream.errors import OverrunError, ProtocolError
+from lanestream.errors import IdleError, OverrunError, ProtocolError, TooOldError
 from lanestream.protocol import FrameMessage, Mode, StartMessage
-from lanestream.sessions.stream_rules import Outcome, StreamLimits, StreamRules
+from lanestream.sessions.stream_rules import Outcome, StreamLimits, StreamRules, check_age
 
 
 def opened(mode: Mode, most: int = 3) -> StreamRules:
@@ -162,3 +162,108 @@ def test_every_frame_is_answered_failed_or_dropped(mode: Mode, steps: list[str])
     assert frames == answered + failed + dropped
     assert order == sorted(set(order))
     assert mode == "latest" or dropped == 0
+
+
+def refused(rules: StreamRules) -> str | None:
+    """The code that the next frame is refused with; None where it is taken."""
+    frame = rules.take()
+    assert frame is not None
+    rules.settle(Outcome.FAILED, 102.0)
+    assert (frame.data == b"") == (frame.refusal is not None), "of a refused frame nothing is kept"
+    return None if frame.refusal is None else frame.refusal.code
+
+
+def limited(mode: Mode, **limits: float) -> StreamRules:
+    rules = StreamRules(StreamLimits(burst_s=1.0, **limits), now=100.0)  # type: ignore[arg-type]
+    rules.start(StartMessage(mode=mode), 100.0)
+    return rules
+
+
+def test_too_many_frames_a_second_are_refused_one_by_one_and_in_order() -> None:
+    rules = limited("all", frames_per_s=3.0)
+    for _ in range(5):
+        rules.receive(b"x", 100.0)
+    assert [refused(rules) for _ in range(5)] == [None] * 3 + ["too_fast"] * 2
+    rules.receive(b"x", 100.4)
+    assert refused(rules) is None
+
+
+def test_too_many_bytes_a_second_are_refused() -> None:
+    rules = limited("all", bytes_per_s=100.0)
+    for size in (60, 30, 30):
+        rules.receive(bytes(size), 100.0)
+    assert [refused(rules) for _ in range(3)] == [None, None, "too_fast"]
+    rules.receive(bytes(5000), 101.0)
+    assert refused(rules) is None, "one image that is larger than a burst needs a full bucket, no more"
+    rules.receive(bytes(1), 102.0)
+    assert refused(rules) == "too_fast", "and is paid for"
+
+
+def test_a_refused_frame_takes_no_waiting_frames_place() -> None:
+    rules = limited("latest", frames_per_s=2.0)
+    for _ in range(40):
+        rules.receive(b"x", 100.0)
+    assert [refused(rules) for _ in range(2)] == [None, None]
+    assert refused(rules) == "too_fast"
+    assert rules.take() is None, "of refused frames the newest one is told, the others count as dropped"
+    assert counts(rules) == (40, 0, 3, 37)
+
+
+def test_only_latest_frames_expire() -> None:
+    for mode, deadline in (("latest", 103.5), ("all", None)):
+        rules = StreamRules(StreamLimits(frame_deadline_s=2.5), now=100.0)
+        rules.start(StartMessage(mode=mode), 100.0)  # type: ignore[arg-type]
+        rules.receive(b"x", 101.0)
+        frame = rules.take()
+        assert frame is not None
+        assert frame.deadline == deadline
+    rules.settle(Outcome.EXPIRED, 102.0)
+    assert counts(rules) == (1, 0, 0, 1)
+
+
+def test_draining_answers_what_came_before_and_refuses_what_comes_after() -> None:
+    rules = opened("all")
+    rules.receive(b"a", 101.0)
+    rules.take()
+    rules.receive(b"b", 101.0)
+    rules.drain()
+    rules.receive(b"c", 101.0)
+    assert not rules.finished
+    rules.settle(Outcome.ANSWERED, 101.0)
+    assert not rules.finished
+    assert refused(rules) is None
+    assert rules.finished
+    assert not rules.ended
+    assert refused(rules) == "draining"
+
+
+def test_a_resumed_stream_counts_on() -> None:
+    rules = opened("all")
+    rules.go_on(41, 7.0, 100.0)
+    rules.receive(b"a", 100.5)
+    frame = rules.take()
+    assert frame is not None
+    assert (frame.seq, frame.timestamp) == (42, 7.5)
+
+
+def test_silence_is_counted_from_the_last_word_or_answer() -> None:
+    rules = StreamRules(StreamLimits(handshake_s=5.0, idle_s=30.0), now=100.0)
+    rules.check_silence(104.9)
+    with pytest.raises(IdleError, match="5 seconds"):
+        rules.check_silence(105.0)
+    rules.start(StartMessage(), 104.0)
+    rules.check_silence(133.9)
+    rules.receive(b"x", 120.0)
+    rules.check_silence(500.0)
+    rules.take()
+    rules.check_silence(500.0)
+    rules.settle(Outcome.ANSWERED, 600.0)
+    assert rules.silence_left(601.0) == pytest.approx(29.0)
+    with pytest.raises(IdleError, match="30 seconds"):
+        rules.check_silence(630.0)
+
+
+def test_a_session_has_a_longest_life() -> None:
+    check_age(9.9, 10.0)
+    with pytest.raises(TooOldError, match="10 seconds old"):
+        check_age(10.0, 10.0)
