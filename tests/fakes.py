@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -140,3 +141,8 @@ def ready(mode: Mode = "all", **other: Any) -> ReadyMessage:
         "limits": limits(),
     }
     return ReadyMessage(mode=mode, **{**usual, **other})
+
+
+def pause(seconds: float) -> None:
+    """Lets real time pass, where a limit of the service is a time."""
+    time.sleep(seconds)

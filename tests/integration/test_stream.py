@@ -5,56 +5,21 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import fakes
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from talking import all_was_read, closed, heard, stream, tell
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from lanestream.detection import Pipeline
 from lanestream.engine import Engine
-from lanestream.protocol import parse_server_message
 
 Serve = Callable[..., str]
 README = Path(__file__).parents[2] / "README.md"
-
-
-@contextmanager
-def stream(url: str, **start: Any) -> Iterator[ClientConnection]:
-    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
-        if start:
-            tell(socket, "start", **start)
-            assert heard(socket)["type"] == "ready"
-        yield socket
-
-
-def tell(socket: ClientConnection, kind: str, **more: Any) -> None:
-    socket.send(json.dumps({"type": kind, **more}))
-
-
-def heard(socket: ClientConnection) -> dict[str, Any]:
-    text = socket.recv(fakes.WAIT_S)
-    assert isinstance(text, str)
-    parse_server_message(text)
-    message: dict[str, Any] = json.loads(text)
-    return message
-
-
-def closed(socket: ClientConnection) -> tuple[int, str]:
-    with pytest.raises(ConnectionClosed) as caught:
-        socket.recv(fakes.WAIT_S)
-    assert caught.value.rcvd is not None
-    return caught.value.rcvd.code, caught.value.rcvd.reason
-
-
-def all_was_read(socket: ClientConnection) -> None:
-    """Returns when the service has taken in all that was sent before: it answers text at once, and in order."""
-    socket.send("?")
-    assert heard(socket)["code"] == "bad_message"
 
 
 def test_the_five_lines_of_the_readme(url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

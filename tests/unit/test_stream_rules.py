@@ -234,7 +234,9 @@ def test_draining_answers_what_came_before_and_refuses_what_comes_after() -> Non
     assert refused(rules) is None
     assert rules.finished
     assert not rules.ended
-    assert refused(rules) == "draining"
+    assert [frame.refusal.code for frame in rules.rest() if frame.refusal] == ["draining"]
+    rules.receive(b"d", 101.0)
+    assert counts(rules) == (3, 1, 2, 0)
 
 
 def test_a_resumed_stream_counts_on() -> None:

@@ -150,7 +150,8 @@ class StreamHandler:
             raise
         for _ in range(superseded):
             metrics.frame_dropped("superseded")
-        self._ensure_session()
+        if not self._rules.over:
+            self._ensure_session()
 
     async def _start(self, message: StartMessage, pipeline: Pipeline) -> None:
         opened = await self._service.sessions.start(self._service.loaded.engine, self._caller, message)
@@ -200,6 +201,9 @@ class StreamHandler:
                 continue
             self._news.clear()
             await self._news.wait()
+        for late in self._rules.rest():
+            if late.refusal is not None:
+                await self._send(self._problem(late.refusal, late.seq))
         # Whoever has seen the summary finds the place free.
         await self._release()
         if self._rules.ended:

@@ -101,6 +101,7 @@ class StreamRules:
         self._busy = False
         self._ended = False
         self._draining = False
+        self._over = False
         self._next_seq = 0
         self._received = self._answered = self._failed = self._dropped = 0
         self._frames = Allowance(limits.frames_per_s, limits.burst_s, now)
@@ -130,6 +131,11 @@ class StreamRules:
     def ended(self) -> bool:
         """Whether the client has said that no more frames come."""
         return self._ended
+
+    @property
+    def over(self) -> bool:
+        """Whether the last answers are given, so that what comes is too late."""
+        return self._over
 
     @property
     def finished(self) -> bool:
@@ -164,10 +170,13 @@ class StreamRules:
     def receive(self, data: bytes, now: float) -> int:
         """A frame comes, and opens the stream where nothing did before; how many waiting ones it took the place of.
 
-        Raises OverrunError in mode `all` where no credit was left for it, and ProtocolError after `end`.
+        After `rest` it is not taken. Raises OverrunError in mode `all` where no credit was left for it, and
+        ProtocolError after `end`.
         """
         self._hear("an image", now)
         self._options = self.options
+        if self._over:
+            return 0
         unanswered = len(self._waiting) + self._busy
         if self.mode == "all" and unanswered >= self._limits.credits:
             raise OverrunError(
@@ -195,6 +204,13 @@ class StreamRules:
             return None
         self._busy = True
         return self._waiting.popleft()
+
+    def rest(self) -> list[IncomingFrame]:
+        """What waits when the stream is finished: refused frames, whose answers are due. What comes now is too late."""
+        rest, self._waiting = list(self._waiting), deque()
+        self._failed += len(rest)
+        self._over = True
+        return rest
 
     def settle(self, outcome: Outcome, now: float) -> None:
         """The frame that was taken has come to its `outcome`. Comes before the reply, which renews the credit."""

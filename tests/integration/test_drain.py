@@ -1,0 +1,150 @@
+"""SIGTERM under load: a service answers what it has taken, says where to go on, and only then closes."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import fakes
+import httpx
+import pytest
+from redisserver import redis_server
+from talking import closed, heard, stream, tell
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from lanestream.api import create_app
+from lanestream.api.server import Server, listen
+from lanestream.settings import Settings
+
+CREDITS = 4
+STREAMS = 4
+
+
+@contextmanager
+def service(**settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A service in a process of its own, ready, and its URL."""
+    environment = {f"LANESTREAM_{name.upper()}": str(value) for name, value in settings.items()}
+    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env={**os.environ, **environment}
+    ) as process:
+        try:
+            assert process.stderr is not None
+            url = ""
+            for line in process.stderr:
+                url = url or "".join(re.findall(r"listening on (\S+),", line))
+                if line.rstrip().endswith(" ready"):
+                    break
+            yield process, url
+        finally:
+            process.kill()
+
+
+@dataclass
+class Camera:
+    """A client in mode `all` that keeps all its credits in use until the service closes."""
+
+    url: str
+    started: threading.Barrier
+    told: list[dict[str, object]] = field(default_factory=list)
+    code: int | None = None
+
+    def run(self) -> None:
+        picture = fakes.image_file(width=640, height=360)
+        with stream(self.url) as socket:
+            tell(socket, "start", mode="all")
+            self.told.append(heard(socket))
+            for _ in range(CREDITS):
+                socket.send(picture)
+            try:
+                while True:
+                    self.told.append(heard(socket))
+                    if len(self.told) == CREDITS + 1:
+                        self.started.wait(fakes.WAIT_S)
+                    if self.told[-1]["type"] != "draining":
+                        # Where the service has closed meanwhile, what it said before is still to be heard.
+                        with suppress(ConnectionClosed):
+                            socket.send(picture)
+            except ConnectionClosed as end:
+                self.code = None if end.rcvd is None else end.rcvd.code
+
+    def of(self, kind: str) -> list[dict[str, object]]:
+        return [message for message in self.told if message["type"] == kind]
+
+
+def test_sigterm_under_load_leaves_no_accepted_frame_unanswered(tmp_path: Path) -> None:
+    with redis_server(tmp_path) as redis_url, service(credits=CREDITS, redis_url=redis_url) as (process, url):
+        started = threading.Barrier(STREAMS + 1)
+        cameras = [Camera(url, started) for _ in range(STREAMS)]
+        threads = [threading.Thread(target=camera.run) for camera in cameras]
+        for thread in threads:
+            thread.start()
+        started.wait(3 * fakes.WAIT_S)
+        process.send_signal(signal.SIGTERM)
+        for thread in threads:
+            thread.join(3 * fakes.WAIT_S)
+        assert process.wait(fakes.WAIT_S) in (0, -signal.SIGTERM)
+        assert process.stderr is not None
+        log = process.stderr.read()
+        counts = re.findall(r"(\d+) frames, (\d+) answered, (\d+) failed, (\d+) dropped", log)
+        assert len(counts) == STREAMS
+        for frames, answered, failed, dropped in ((int(n) for n in count) for count in counts):
+            assert frames == answered + failed
+            assert dropped == 0
+        for camera in cameras:
+            assert camera.code == 1012
+            (draining,) = camera.of("draining")
+            assert draining["resume_token"] == camera.of("ready")[0]["resume_token"]
+            replies = [message for message in camera.told if message["type"] in ("lanes", "error")]
+            assert [reply["seq"] for reply in replies] == list(range(len(replies))), (
+                "answers come in order, none is left out"
+            )
+            assert {error["code"] for error in camera.of("error")} <= {"draining"}
+        told = sorted(sum(message["type"] in ("lanes", "error") for message in camera.told) for camera in cameras)
+        assert told == sorted(int(count[0]) for count in counts), "every frame that the service took was answered"
+        with service(redis_url=redis_url) as (_, other):
+            for camera in cameras:
+                with stream(other) as socket:
+                    tell(socket, "start", mode="all", resume_token=camera.of("ready")[0]["resume_token"])
+                    ready = heard(socket)
+                    assert ready["resumed"]
+                    assert ready["last_seq"] == camera.of("lanes")[-1]["seq"]
+
+
+def test_while_it_drains_a_service_takes_nothing_new_and_finishes_what_it_has() -> None:
+    network = fakes.GatedNetwork()
+    app = create_app(fakes.engine(network), Settings(), None)
+    listener = listen("127.0.0.1", 0)
+    server = Server(app, Settings())
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    with stream(url) as socket:
+        tell(socket, "start", mode="all")
+        heard(socket)
+        socket.send(fakes.image_file())
+        network.wait_for_a_frame()
+        server.should_exit = True
+        assert heard(socket)["type"] == "draining"
+        socket.send(fakes.image_file())
+        assert httpx.get(f"{url}/healthz").is_success
+        refused = httpx.get(f"{url}/readyz")
+        assert (refused.status_code, refused.json()["code"]) == (503, "draining")
+        assert httpx.post(f"{url}/v1/detect", content=fakes.image_file()).status_code == 503
+        with pytest.raises(InvalidStatus) as denied, stream(url):
+            pass
+        assert json.loads(denied.value.response.body or b"")["code"] == "draining"
+        network.let_through()
+        assert (heard(socket)["type"], heard(socket)["code"]) == ("lanes", "draining")
+        assert closed(socket)[0] == 1012
+    thread.join(fakes.WAIT_S)
+    assert not thread.is_alive()
