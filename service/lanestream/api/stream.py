@@ -85,7 +85,7 @@ class StreamHandler:
         self._evicted = False
 
     def wake(self) -> None:
-        """Has the stream look whether the service is about to stop."""
+        """Has the stream look at the clock, and whether the service is about to stop."""
         self._alarm.set()
 
     async def run(self) -> None:
@@ -172,6 +172,8 @@ class StreamHandler:
     def _attach(self, opened: OpenSession) -> None:
         self._opened = opened
         opened.on_evict = self._evict
+        # An open stream has other limits of time.
+        self.wake()
         self._service.metrics.session_opened()
         options = self._rules.options
         detector = self._service.loaded.engine.pipeline(options.detector).name
