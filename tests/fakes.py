@@ -56,6 +56,8 @@ class FakeNetwork:
     name = "fake 1"
     provider = "cpu"
     reason = "there is nothing else"
+    fell_back = False
+    sha256 = "fa4e"
     buckets = (1, 16)
     metadata: dict[str, Any] = {"kind": "fake"}  # noqa: RUF012
 

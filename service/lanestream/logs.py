@@ -29,8 +29,26 @@ class TextFormatter(logging.Formatter):
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  (the library's name)
         """The record in one line, without its traceback."""
-        told = [f" {name}={getattr(record, name)}" for name in _CONTEXT if hasattr(record, name)]
+        context = {name: getattr(record, name, None) for name in _CONTEXT}
+        told = [f" {name}={value}" for name, value in context.items() if value is not None]
         return super().formatMessage(record) + "".join(told)
+
+
+class JsonLines(JsonFormatter):
+    """One JSON object a line for machines, with the time first; a traceback is one field of it."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            ["levelname", "name", "message"],
+            rename_fields=_NAMES,
+            defaults={_TIME: None},  # which keeps the first place for it
+            timestamp=_TIME,
+            reserved_attrs=[*RESERVED_ATTRS, *_OF_LIBRARIES],
+        )
+
+    def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
+        """The record without what does not concern it."""
+        return {name: value for name, value in log_data.items() if value is not None}
 
 
 class WithoutQueries(logging.Filter):
@@ -51,17 +69,6 @@ class WithoutFalseAlarms(logging.Filter):
         return record.msg != "ASGI callable returned without completing handshake."
 
 
-def json_formatter() -> logging.Formatter:
-    """One JSON object a line, with the time first; a traceback is one field of it."""
-    return JsonFormatter(
-        ["levelname", "name", "message"],
-        rename_fields=_NAMES,
-        defaults={_TIME: None},  # which keeps the place for it
-        timestamp=_TIME,
-        reserved_attrs=[*RESERVED_ATTRS, *_OF_LIBRARIES],
-    )
-
-
 def log_config(settings: Settings) -> dict[str, Any]:
     """The configuration, for `logging.config.dictConfig`, that `settings` ask for."""
     level = settings.log_level
@@ -70,7 +77,7 @@ def log_config(settings: Settings) -> dict[str, Any]:
     return {
         "version": 1,
         "disable_existing_loggers": False,
-        "formatters": {"lines": {"()": TextFormatter if settings.log_format == "text" else json_formatter}},
+        "formatters": {"lines": {"()": TextFormatter if settings.log_format == "text" else JsonLines}},
         "filters": {"queries": {"()": WithoutQueries}, "alarms": {"()": WithoutFalseAlarms}},
         "handlers": {
             "stderr": {"class": "logging.StreamHandler", "formatter": "lines", "filters": ["queries", "alarms"]},

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import fakes
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR
 
 Serve = Callable[..., str]
+OPERATIONS = Path(__file__).parents[2] / "docs" / "operations.md"
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
@@ -25,7 +34,7 @@ def samples(url: str, **headers: str) -> Samples:
     }
 
 
-def value(found: Samples, name: str, **labels: str) -> float:
+def value(found: Samples, name: str, /, **labels: str) -> float:
     return found[name, frozenset(labels.items())]
 
 
@@ -69,7 +78,75 @@ def test_what_runs_is_told_once_it_is_loaded(serve: Serve) -> None:
     name, labels = "lane_inference_provider_info", {"provider": "cpu", "device": "cpu", "precision": "unknown"}
     assert all(name != sample for sample, _ in samples(serve()))
     found = samples(serve(fakes.two_detectors()))
-    assert [value(found, name, network=network, **labels) for network in ("fake 1", "other 2")] == [1.0, 1.0]
+    for network in ("fake 1", "other 2"):
+        assert value(found, name, network=network, **labels) == 1
+        assert value(found, "lane_provider_fallback", network=network) == 0
+        assert value(found, "lane_model_info", name=network, version="unknown", sha256="fa4e") == 1
+
+
+def test_a_provider_that_was_missed_is_told(serve: Serve) -> None:
+    class Fallen(fakes.FakeNetwork):
+        fell_back = True
+
+    found = samples(serve(fakes.engine(Fallen())))
+    assert value(found, "lane_provider_fallback", network="fake 1") == 1
+
+
+def test_the_shipped_networks_are_told_by_their_files(real_url: str) -> None:
+    found = samples(real_url)
+    told = {dict(labels)["name"]: dict(labels) for name, labels in found if name == "lane_model_info"}
+    for path in (SHIPPED_MODEL, SHIPPED_REGRESSOR):
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        (entry,) = [each for each in told.values() if each["sha256"] == digest]
+        assert entry["version"].count(".") == 2
+    labels = {dict(labels)["precision"] for name, labels in found if name == "lane_inference_provider_info"}
+    assert labels <= {"int8", "fp16", "fp32"}
+
+
+def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    url = serve(fakes.engine(network))
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
+        socket.send(fakes.image_file())
+        network.wait_for_a_frame()
+        for _ in range(4):
+            socket.send(fakes.image_file())
+        socket.send("?")
+        assert json.loads(socket.recv(fakes.WAIT_S))["code"] == "bad_message"
+        found = samples(url)
+        assert value(found, "lane_sessions_active") == 1
+        assert value(found, "lane_frames_received_total") == 5
+        assert value(found, "lane_frames_dropped_total", reason="superseded") == 3
+        assert value(found, "lane_frames_processed_total") == 0
+        network.let_through(2)
+        for _ in range(2):
+            assert json.loads(socket.recv(fakes.WAIT_S))["type"] == "lanes"
+        socket.send(b"no image")
+        assert json.loads(socket.recv(fakes.WAIT_S))["code"] == "bad_image"
+        socket.send('{"type": "end"}')
+        assert json.loads(socket.recv(fakes.WAIT_S))["type"] == "summary"
+        with pytest.raises(ConnectionClosed):
+            socket.recv(fakes.WAIT_S)
+    found = samples(url)
+    assert value(found, "lane_sessions_active") == 0
+    assert value(found, "lane_frames_processed_total") == value(found, "lane_frame_age_seconds_count") == 2
+    assert value(found, "lane_frames_dropped_total", reason="decode_error") == 1
+    assert value(found, "lane_refusals_total", code="bad_message") == 1
+    assert value(found, "lane_refusals_total", code="bad_image") == 1
+    assert value(found, "lane_ws_closes_total", code="1000") == 1
+    dropped = sum(count for (name, _), count in found.items() if name == "lane_frames_dropped_total")
+    assert value(found, "lane_frames_received_total") == dropped + value(found, "lane_frames_processed_total")
+
+
+def test_the_manual_has_every_metric(url: str) -> None:
+    httpx.post(f"{url}/v1/detect", content=b"no image")
+    families = text_string_to_metric_families(httpx.get(f"{url}/metrics").text)
+    told = {
+        f"{family.name}_total" if family.type == "counter" else family.name
+        for family in families
+        if family.name.startswith("lane_") and not family.name.endswith("_created")
+    }
+    assert told == set(re.findall(r"^\| `(lane_\w+)` \|", OPERATIONS.read_text(), re.MULTILINE))
 
 
 def test_services_of_one_process_count_apart(serve: Serve) -> None:

@@ -140,7 +140,9 @@ def test_unknown_paths_and_methods_are_told_alike(url: str) -> None:
 
 def test_what_runs_is_told(url: str) -> None:
     network = {"name": "fake 1", "detector": "candidates", "provider": "cpu"}
-    assert httpx.get(f"{url}/v1/models").json() == {"models": [{**network, "metadata": {"kind": "fake"}}]}
+    assert httpx.get(f"{url}/v1/models").json() == {
+        "models": [{**network, "sha256": "fa4e", "metadata": {"kind": "fake"}}]
+    }
     assert httpx.get(f"{url}/healthz").json() == {"status": "alive"}
     assert httpx.get(f"{url}/readyz").json() == {"status": "ready", "provider": "cpu", "networks": [network]}
 

@@ -9,7 +9,7 @@ from datetime import datetime
 
 import pytest
 
-from lanestream.logs import TextFormatter, WithoutFalseAlarms, WithoutQueries, json_formatter, log_config
+from lanestream.logs import JsonLines, TextFormatter, WithoutFalseAlarms, WithoutQueries, log_config
 from lanestream.settings import Settings
 
 
@@ -28,7 +28,7 @@ def failed() -> logging.LogRecord:
 
 
 def test_json_has_what_happened_when_where_and_to_whom() -> None:
-    told = json.loads(json_formatter().format(record("frame %s", 3, session="abc", seq=3, color_message="x")))
+    told = json.loads(JsonLines().format(record("frame %s", 3, session="abc", seq=3, color_message="x")))
     time = datetime.fromisoformat(told.pop("time"))
     assert time.tzinfo is not None
     assert list(told.items()) == [
@@ -41,7 +41,7 @@ def test_json_has_what_happened_when_where_and_to_whom() -> None:
 
 
 def test_an_exception_is_one_field_of_one_line() -> None:
-    line = json_formatter().format(failed())
+    line = JsonLines().format(failed())
     assert "\n" not in line
     told = json.loads(line)
     assert told["message"] == "it failed"
@@ -53,7 +53,9 @@ def test_text_has_the_same() -> None:
     first, *rest = TextFormatter().format(failed()).splitlines()
     assert first.endswith(" WARNING lanestream.test: it failed session=abc seq=3")
     assert rest[-1] == "ValueError: why"
-    assert TextFormatter().format(record("hello")).endswith(" WARNING lanestream.test: hello")
+    for nothing in ({}, {"session": None, "seq": None}):
+        assert TextFormatter().format(record("hello", **nothing)).endswith(" WARNING lanestream.test: hello")
+        assert set(json.loads(JsonLines().format(record("hello", **nothing)))) == {"time", "level", "logger", "message"}
 
 
 def test_queries_are_cut_off() -> None:

@@ -1,5 +1,6 @@
 """Which provider is taken, what is said of it, and that networks answer alike whichever runs them."""
 
+import hashlib
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,8 @@ def test_every_bucket_is_warmed(classifier: OnnxModel) -> None:
 
 def test_auto_takes_the_cpu_where_there_is_nothing_else_and_says_why() -> None:
     network = load_network(SHIPPED_MODEL, "auto", offer=CPU_ALONE)
+    assert not network.fell_back, "what is not installed is not missed"
+    assert network.sha256 == hashlib.sha256(SHIPPED_MODEL.read_bytes()).hexdigest()
     assert network.provider == "cpu"
     assert network.reason.startswith("the installed onnxruntime has no CUDA; OpenVINO is not installed; ")
 
@@ -112,7 +115,7 @@ def test_cuda_that_is_built_in_and_does_not_work_is_found_out() -> None:
         load_network(SHIPPED_MODEL, "cuda", offer=WITH_CUDA)
     assert "lanestream doctor" in no.value.hint
     network = load_network(SHIPPED_MODEL, "auto", offer=WITH_CUDA)
-    assert network.provider == "cpu"
+    assert (network.provider, network.fell_back) == ("cpu", True)
     assert "CUDA can't be used" in network.reason
 
 

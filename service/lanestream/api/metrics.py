@@ -65,6 +65,10 @@ class Metrics:
         self._provider = self._gauge(
             "lane_inference_provider_info", "What runs a network.", "network", "provider", "device", "precision"
         )
+        self._fallback = self._gauge(
+            "lane_provider_fallback", "1 where a better provider is installed and can't be used.", "network"
+        )
+        self._model = self._gauge("lane_model_info", "The file of a network.", "name", "version", "sha256")
         self._stages = self._histogram(
             "lane_stage_seconds", "Time of the stages of an answered frame.", _STAGE_BUCKETS, "stage"
         )
@@ -132,8 +136,10 @@ class Metrics:
         """A detector is ready, with a network."""
         network = pipeline.network
         device = "gpu" if network.provider in _ON_GPU else "cpu"
-        precision = network.metadata.get("precision", "unknown")
-        self._provider.labels(network.name, network.provider, device, precision).set(1)
+        told = network.metadata
+        self._provider.labels(network.name, network.provider, device, told.get("precision", "unknown")).set(1)
+        self._fallback.labels(network.name).set(network.fell_back)
+        self._model.labels(told.get("name", network.name), told.get("version", "unknown"), network.sha256).set(1)
 
     def exposition(self) -> bytes:
         """All of it in Prometheus' text format, of the type `MEDIA_TYPE`."""

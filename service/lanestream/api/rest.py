@@ -59,9 +59,15 @@ class NetworkEntry(BaseModel):
 
 
 class ModelEntry(NetworkEntry):
-    """A loaded network, and what its file says of itself."""
+    """A loaded network, the SHA-256 of its file, and what that says of itself."""
 
+    sha256: str
     metadata: dict[str, Any]
+
+    @classmethod
+    def about(cls, pipeline: Pipeline) -> Self:
+        """The entry of a pipeline's network."""
+        return cls.of(pipeline, sha256=pipeline.network.sha256, metadata=dict(pipeline.network.metadata))
 
 
 class ModelList(BaseModel):
@@ -152,7 +158,7 @@ async def detect(
 async def models(request: Request) -> ModelList:
     """The networks that are loaded, the default detector's first, and what really runs them."""
     pipelines = _service(request).loaded.engine.pipelines
-    return ModelList(models=[ModelEntry.of(each, metadata=dict(each.network.metadata)) for each in pipelines])
+    return ModelList(models=[ModelEntry.about(pipeline) for pipeline in pipelines])
 
 
 @open_router.get("/v1/schema")

@@ -83,6 +83,7 @@ class StreamHandler:
         self._news = asyncio.Event()
         self._alarm = asyncio.Event()
         self._evicted = False
+        self._closed = False
 
     def wake(self) -> None:
         """Has the stream look at the clock, and whether the service is about to stop."""
@@ -94,7 +95,7 @@ class StreamHandler:
         try:
             await self._converse()
         except WebSocketDisconnect as gone:
-            self._service.metrics.socket_closed(gone.code)
+            self._count_close(gone.code)
         except Exception as error:
             if not isinstance(error, LanestreamError):
                 _log.exception("stream failed", extra=self._named())
@@ -121,7 +122,7 @@ class StreamHandler:
             except (ProtocolError, NoDetectorError) as error:
                 await self._tell(error)
             self._news.set()
-        self._service.metrics.socket_closed(message["code"])
+        self._count_close(message["code"])
 
     async def _take_in(self, text: str | None, data: bytes | None) -> None:
         now = time.monotonic()
@@ -311,8 +312,14 @@ class StreamHandler:
         await self._socket.send_text(message.model_dump_json())
 
     async def _close(self, code: int, reason: str = "") -> None:
+        self._count_close(code)
         await self._socket.close(code, reason)
-        self._service.metrics.socket_closed(code)
+
+    def _count_close(self, code: int) -> None:
+        """The side that closes first gives the code; what the other one answers is no second close."""
+        if not self._closed:
+            self._closed = True
+            self._service.metrics.socket_closed(code)
 
     async def _end_with(self, error: Exception) -> None:
         """Tells what ended the stream. Whoever sees its socket closed finds its session ready to be resumed."""

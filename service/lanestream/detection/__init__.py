@@ -92,6 +92,16 @@ class Network(Protocol):
         ...
 
     @property
+    def fell_back(self) -> bool:
+        """Whether a better one is installed and can't be used."""
+        ...
+
+    @property
+    def sha256(self) -> str:
+        """The SHA-256 of the model file, in hexadecimal digits; empty where nobody looked."""
+        ...
+
+    @property
     def buckets(self) -> tuple[int, ...]:
         """The batch sizes that it runs, smaller ones padded; it is best asked no more at a time than the largest."""
         ...

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 from lanestream.errors import ProviderError
@@ -22,14 +24,22 @@ def load_network(
     """
     offer = offer or offered()
     passed_over: list[str] = []
+    fell_back = False
     for name, why in attempts(provider).items():
+        installed = False
         try:
             require(name, offer)
-            return _load(path, name, options, "; ".join([*passed_over, why]))
+            installed = True
+            network = _load(path, name, options, "; ".join([*passed_over, why]))
         except ProviderError as error:
             if provider != "auto" or name == "cpu":
                 raise
             passed_over.append(error.message)
+            fell_back |= installed
+        else:
+            network.placement = replace(network.placement, fell_back=fell_back)
+            network.sha256 = _sha256(path)
+            return network
     raise AssertionError("the CPU is the last one tried")
 
 
@@ -37,3 +47,8 @@ def _load(path: Path, provider: Loadable, options: RuntimeOptions, reason: str) 
     if provider == "openvino":
         return OpenVinoModel.load(path, options, reason)
     return OnnxModel.load(path, provider, options, reason)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -19,7 +19,8 @@ class Placement:
     """Where a network really runs, and how.
 
     `provider` is the execution provider and `reason` why that one; `nodes` counts the graph's nodes by what runs them.
-    `buckets` are the batch sizes that it runs, ascending. `threads` are those of one run, on the CPU.
+    `buckets` are the batch sizes that it runs, ascending. `threads` are those of one run, on the CPU. It
+    `fell_back` where a provider that is installed, and would have been better, can't be used.
     """
 
     provider: str
@@ -27,14 +28,19 @@ class Placement:
     threads: int
     nodes: Mapping[str, int]
     buckets: tuple[int, ...]
+    fell_back: bool = False
 
 
 class LoadedNetwork(ABC):
-    """A network that is ready to be asked. Threads may share it; it runs one batch at a time."""
+    """A network that is ready to be asked. Threads may share it; it runs one batch at a time.
+
+    `sha256` is that of its file, in hexadecimal digits; empty where nobody looked.
+    """
 
     def __init__(self, info: ModelInfo, placement: Placement) -> None:
         self.info = info
         self.placement = placement
+        self.sha256 = ""
         # A run takes all processors or the whole device: two at once gain nothing, and need the memory of two.
         self._running = threading.Lock()
 
@@ -52,6 +58,11 @@ class LoadedNetwork(ABC):
     def reason(self) -> str:
         """Why that one."""
         return self.placement.reason
+
+    @property
+    def fell_back(self) -> bool:
+        """Whether a better one is installed and can't be used."""
+        return self.placement.fell_back
 
     @property
     def buckets(self) -> tuple[int, ...]:
