@@ -16,7 +16,7 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 from lanestream.api import create_app
 from lanestream.api.access import Gatekeeper, warn_if_open
@@ -177,8 +177,17 @@ def test_a_page_of_a_foreign_origin_is_refused_before_the_handshake(serve: Serve
         ("", "http://", 403),
     ],
 )
-def test_our_own_pages_are_told_by_host_and_port(url: str, host: str, origin: str, status: int) -> None:
-    assert httpx.get(f"{url}/v1/models", headers={"host": host, "origin": origin}).status_code == status
+def test_our_own_pages_are_told_by_host_and_port(guarded: str, host: str, origin: str, status: int) -> None:
+    headers = {"host": host, "origin": origin, **bearer(TOKEN)}
+    assert httpx.get(f"{guarded}/v1/models", headers=headers).status_code == status
+
+
+@pytest.mark.parametrize(
+    ("host", "status"), [("localhost:1", 200), ("10.0.0.7", 200), ("[::1]:1", 200), ("lanes.test", 403)]
+)
+def test_without_keys_a_name_may_have_been_led_to_us(url: str, host: str, status: int) -> None:
+    headers = {"host": host, "origin": f"http://{host}"}
+    assert httpx.get(f"{url}/v1/models", headers=headers).status_code == status
 
 
 def test_pages_of_listed_origins_may_read_answers(guarded: str) -> None:
@@ -242,6 +251,27 @@ def _with_key(token: str, *, in_header: bool) -> dict[str, Any]:
     return (
         {"additional_headers": bearer(token)} if in_header else {"subprotocols": ["lanestream.v1", f"bearer.{token}"]}
     )
+
+
+def start(socket: ClientConnection, **more: str) -> dict[str, Any]:
+    socket.send(json.dumps({"type": "start", **more}))
+    told: dict[str, Any] = json.loads(socket.recv(fakes.WAIT_S))
+    return told
+
+
+def test_sessions_belong_to_a_key_and_are_counted_by_it(serve: Serve) -> None:
+    url = serve(fakes.engine(), api_keys=f"{KEY},{OTHER_KEY}", max_sessions_per_caller=1).replace("http", "ws")
+    place = f"{url}/v1/stream"
+    with connect(place, additional_headers=bearer(TOKEN)) as mine:
+        token = start(mine)["resume_token"]
+        with connect(place, additional_headers=bearer(TOKEN)) as second:
+            assert start(second)["code"] == "busy"
+        with connect(place, additional_headers=bearer(OTHER_TOKEN)) as theirs:
+            assert start(theirs, resume_token=token)["resumed"] is False
+        mine.send(fakes.image_file())
+        assert json.loads(mine.recv(fakes.WAIT_S))["type"] == "lanes", "and mine goes on"
+    with connect(place, additional_headers=bearer(TOKEN)) as again:
+        assert start(again, resume_token=token)["resumed"] is True
 
 
 def log_of(arguments: list[str], settings: dict[str, str], use: Callable[[str], None]) -> list[str]:

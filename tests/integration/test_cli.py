@@ -228,6 +228,32 @@ def test_a_bad_variable_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> No
     assert errors.startswith("error: LANESTREAM_PORT = 'many': input should be a valid integer")
 
 
+def test_settings_are_printed_without_their_secrets(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("lanestream.toml").write_text('redis_url = "redis://:secret@host/0"\nport = 8123\n')
+    monkeypatch.setenv("LANESTREAM_API_KEYS", f"camera-7:{'5ec7e7' * 10}0123")
+    code, output, errors = run("serve", "--config", "lanestream.toml", "--host", "::1", "--print-config")
+    assert (code, errors) == (0, "")
+    lines = output.splitlines()
+    for line in ('host = "::1"', "port = 8123", 'api_keys = ["camera-7:***"]', 'redis_url = "redis://***@host/0"'):
+        assert line in lines
+    assert "secret" not in output
+    assert "5ec7e7" not in output
+
+
+def test_a_password_is_not_told_where_the_url_is_none(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LANESTREAM_REDIS_URL", "redis://:secret/word@host:6379")
+    code, _, errors = run("serve", "--port", "0")
+    assert (code, errors.count("\n")) == (1, 1)
+    assert errors.startswith("error: the URL of Redis is none (")
+    assert "secret" not in errors
+
+
+def test_a_name_of_a_key_that_can_not_be_is_told(run: Run) -> None:
+    code, output, errors = run("key", "camera 7")
+    assert (code, output) == (1, "")
+    assert errors.startswith("error: 'camera 7' can't be the name of a key (")
+
+
 @pytest.mark.parametrize("option", ["--model", "--regressor"])
 @pytest.mark.parametrize("name", ["model.onnx", "none.onnx"])
 def test_a_model_that_is_none_ends_the_service(run: Run, tmp_path: Path, option: str, name: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -136,6 +137,25 @@ def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
     assert value(found, "lane_ws_closes_total", code="1000") == 1
     dropped = sum(count for (name, _), count in found.items() if name == "lane_frames_dropped_total")
     assert value(found, "lane_frames_received_total") == dropped + value(found, "lane_frames_processed_total")
+
+
+def test_frames_whose_client_is_gone_are_counted_too(serve: Serve) -> None:
+    network = fakes.GatedNetwork()
+    url = serve(fakes.engine(network))
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
+        socket.send('{"type": "start", "mode": "all"}')
+        socket.recv(fakes.WAIT_S)
+        for _ in range(3):
+            socket.send(fakes.image_file())
+        network.wait_for_a_frame()
+        socket.send("?")
+        socket.recv(fakes.WAIT_S)
+    network.let_through(3)
+    ends = time.monotonic() + fakes.WAIT_S
+    while value(found := samples(url), "lane_sessions_active") and time.monotonic() < ends:
+        time.sleep(0.01)
+    assert value(found, "lane_frames_received_total") == 3
+    assert value(found, "lane_frames_dropped_total", reason="disconnected") == 3
 
 
 def test_the_manual_has_every_metric(url: str) -> None:

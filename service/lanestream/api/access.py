@@ -5,6 +5,7 @@ Routes are guarded by what they are, never by how their path reads: a request ca
 
 from __future__ import annotations
 
+import ipaddress
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,11 +63,22 @@ class Gatekeeper:
     def _check_origin(self, connection: HTTPConnection) -> None:
         """Browsers tell the page's origin, and let no page tell another; what is no browser mostly tells none."""
         origin = connection.headers.get("origin")
-        if origin is None or origin in self.origins or _is_ours(origin, connection.headers.get("host", "")):
+        if origin is None or origin in self.origins or self._is_ours(origin, connection.headers.get("host", "")):
             return
         raise ForbiddenError(
             "web pages of this origin may not use the service", "add the origin to LANESTREAM_ALLOWED_ORIGINS"
         )
+
+    def _is_ours(self, origin: str, host: str) -> bool:
+        """Whether a page of this origin came from us; `host` is what its browser calls us, with the port."""
+        # Only the page knows whether a proxy in front of us speaks TLS, and with that which port goes without saying.
+        scheme = origin.partition("://")[0]
+        place = _place(origin)
+        if place is None or place != _place(f"{scheme}://{host}"):
+            return False
+        # Whoever owns a name can have it lead to us after a browser has loaded their page by it (DNS rebinding). Nobody
+        # can do that to an address; and where keys are asked for, their page has none.
+        return bool(self.keys) or _is_fixed(place[0])
 
 
 def warn_if_open(gatekeeper: Gatekeeper, host: str, *, loopback: bool) -> None:
@@ -90,14 +102,6 @@ def _token(connection: HTTPConnection) -> str | None:
     return None
 
 
-def _is_ours(origin: str, host: str) -> bool:
-    """Whether a page of this origin came from us; `host` is what its browser calls us, with the port."""
-    # Only the page knows whether a proxy in front of us speaks TLS, and with that which port goes without saying.
-    scheme = origin.partition("://")[0]
-    place = _place(origin)
-    return place is not None and place == _place(f"{scheme}://{host}")
-
-
 def _place(url: str) -> tuple[str, int | None] | None:
     """The host and the port of a URL; None where it names no host."""
     try:
@@ -106,3 +110,14 @@ def _place(url: str) -> tuple[str, int | None] | None:
     except ValueError:
         return None
     return (parts.hostname, port) if parts.hostname else None
+
+
+def _is_fixed(host: str) -> bool:
+    """Whether no name service decides where this host is."""
+    if host == "localhost":
+        return True
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lanestream.detection import Pipeline
     from lanestream.inference.batcher import BatchReport
 
-DropReason = Literal["superseded", "expired", "overload", "decode_error", "too_large", "rate", "error"]
+DropReason = Literal["superseded", "expired", "overload", "decode_error", "too_large", "rate", "disconnected", "error"]
 ResumeResult = Literal["resumed", "unknown", "refused"]
 
 MEDIA_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4

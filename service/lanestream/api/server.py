@@ -37,8 +37,8 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: Draw | None = No
     """
     # The pool of frame threads is the parallelism; OpenCV's own on top of it would have them fight for processors.
     cv2.setNumThreads(settings.opencv_threads)
-    listener = listen(settings.host, settings.port)
     app = create_app(None, settings, draw)
+    listener = listen(settings.host, settings.port)
     server = Server(app, settings)
     with suppress(KeyboardInterrupt), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
         runner.run(_serve(server, listener, app, load))

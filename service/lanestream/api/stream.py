@@ -294,6 +294,8 @@ class StreamHandler:
         await self._service.sessions.close(opened, for_good=self._rules.ended)
         self._service.metrics.session_closed()
         count = self._rules.summary(time.monotonic())
+        for _ in range(count.frames - count.answered - count.failed - count.dropped):
+            self._service.metrics.frame_dropped("disconnected")
         _log.info(
             "stream closed after %.1f s: %d frames, %d answered, %d failed, %d dropped",
             *(count.duration_s, count.frames, count.answered, count.failed, count.dropped),

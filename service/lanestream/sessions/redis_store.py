@@ -44,9 +44,11 @@ class RedisStore:
     def __init__(self, url: str) -> None:
         try:
             self._redis = Redis.from_url(url, socket_timeout=_TIMEOUT_S, socket_connect_timeout=_TIMEOUT_S)
-        except ValueError as error:
+        except ValueError:
+            # Of which the text may have the password in it.
             raise SettingsError(
-                f"the URL of Redis is none: {str(error).partition(' (')[0]}", "redis://host:6379/0 or rediss://..."
+                "the URL of Redis is none",
+                "redis://host:6379/0, or rediss://name:password@host:6379/0 with the password's odd characters as %XX",
             ) from None
         self._take = self._redis.register_script(_TAKE)
         self._save = self._redis.register_script(_SAVE)
