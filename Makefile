@@ -21,7 +21,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: evaluate proposals demo serve train-toy test lint picture image image-test clean
+.PHONY: evaluate proposals demo serve train-toy test lint picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -60,6 +60,17 @@ image:
 
 image-test: $(RUN_READY)
 	$(BIN)/python tools/image_check.py --target $(VARIANT)
+
+COMPOSE = $(ENGINE) compose -f docker/compose.yaml --profile $(VARIANT)
+
+up: image
+	docker/make-secrets $(ENGINE) run --rm lanestream:$(VARIANT)
+	$(COMPOSE) up --detach --wait
+	@echo 'the service: http://127.0.0.1:8000, its key in docker/secrets/local_key'
+	@echo 'its dashboard: http://127.0.0.1:3000, user admin, password in docker/secrets/grafana_password'
+
+down:
+	$(COMPOSE) down
 
 clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .hypothesis

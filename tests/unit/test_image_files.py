@@ -11,6 +11,8 @@ from types import ModuleType
 
 import pytest
 
+from lanestream.settings import Settings
+
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
 
@@ -97,3 +99,15 @@ def test_the_version_of_python_is_one_that_the_product_supports() -> None:
     base = re.search(r"python:(\d+)\.(\d+)", values("ARG")[0])
     assert base is not None
     assert tuple(map(int, base.groups())) >= tuple(map(int, supported.split(".")))
+
+
+def test_what_the_page_about_deployment_points_to_is_there() -> None:
+    page = ROOT / "docs/deployment.md"
+    text = page.read_text()
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert (page.parent / target).exists(), target
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert set(re.findall(r"\bmake ([a-z-]+)(?= |`|$)", text)) <= set(targets)
+    assert {name.lower() for name in re.findall(r"LANESTREAM_([A-Z_]+)", text)} - {"publish"} <= set(
+        Settings.model_fields
+    )
