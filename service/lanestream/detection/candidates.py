@@ -57,7 +57,9 @@ class CandidateSearch:
     vanishing: VanishingPointSearch = VanishingPointSearch()
     perspective: PerspectiveSearch = PerspectiveSearch()
     sources: tuple[Source, ...] = ("pairs", "singles", "rays")
-    near_prior: PerspectiveSearch = PerspectiveSearch(spread_x=0.03, nod=0.01, spread_bend=0.015)
+    near_prior: PerspectiveSearch = PerspectiveSearch(
+        spread_x=0.03, nod=0.01, spread_bend=0.015, rounds=((5, 0.8), (5, 0.3), (5, 0.1))
+    )
     fan: Fan = Fan()
     limit: int = 16
     least_width: float = 0.03

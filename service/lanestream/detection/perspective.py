@@ -50,7 +50,7 @@ class RidgePoints:
     weight: NDArray[np.float64]
 
 
-def find_ridges(grey: Image, horizon: float, width: float = 0.1, limit: int = 1000) -> RidgePoints:
+def find_ridges(grey: Image, horizon: float, width: float = 0.1, limit: int = 600) -> RidgePoints:
     """The strongest local maxima of a bar filter that is `width` times the depth of each row wide, in a grey image."""
     bottom = grey.shape[0] - 1
     rows = np.unique(np.linspace(horizon + 0.08 * (bottom - horizon), bottom, 112).astype(int))
@@ -87,7 +87,8 @@ class PerspectiveSearch:
     `spread_x` and `spread_y` are how far the vanishing point may lie from the guess, in image widths, and `spread_bend`
     the strongest bend; of a horizon that is known, the row is only `nod` away, as a camera nods on its wheels. Ridges
     gather in cells of `cell` image widths on the bottom row; `prior` is the share of the best score that a hypothesis
-    at the end of its spread must make up for.
+    at the end of its spread must make up for. Each of `rounds` tries so many values of all three, within so much of
+    the spread about the best ones so far.
     """
 
     spread_x: float = 0.12
@@ -97,6 +98,7 @@ class PerspectiveSearch:
     cell: float = 0.012
     reach: float = 3.0
     prior: float = 0.15
+    rounds: tuple[tuple[int, float], ...] = ((7, 1.0), (5, 0.3), (5, 0.1))
 
     def refine(self, guess: Perspective, ridges: RidgePoints, width: int, bottom: float, known: bool) -> Perspective:
         """`guess` moved to where `ridges` gather most; `known` tells that its row is."""
@@ -105,7 +107,7 @@ class PerspectiveSearch:
         spread = np.array([self.spread_x * width, (self.nod if known else self.spread_y) * width, self.spread_bend])
         start = np.array([guess.x, guess.y, guess.bend])
         best = start
-        for steps, share in ((7, 1.0), (5, 0.3), (5, 0.1)):
+        for steps, share in self.rounds:
             axes = best[:, None] + np.linspace(-share, share, steps) * spread[:, None]
             score = self._gathering(axes, ridges, width, bottom)
             x, y, bend = ((axes - start[:, None]) / spread[:, None]) ** 2
