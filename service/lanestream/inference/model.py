@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +15,7 @@ from lanestream.errors import ModelError, ProviderError, one_line
 from lanestream.inference.model_info import ModelInfo, parse_info, require_file
 from lanestream.inference.network import LoadedNetwork, Placement
 from lanestream.inference.providers import NAMES, OnnxProvider, verify
+from lanestream.machine import preload_gpu_libraries
 from lanestream.processors import processors
 from lanestream.runtime import DEFAULT_OPTIONS, RuntimeOptions
 
@@ -105,9 +104,7 @@ def _cpu_session(path: Path, threads: int | None) -> Any:
 def _gpu_session(path: Path, provider: Literal["cuda", "tensorrt"], options: RuntimeOptions) -> Any:
     # What is wrong with the file is told before the device is asked, and is not taken for its fault.
     info = _info(_cpu_session(path, 1), path)
-    with contextlib.redirect_stdout(sys.stderr):
-        # The CUDA libraries of Python packages are not on the loader's path. What it can't find it prints.
-        onnxruntime.preload_dlls()
+    preload_gpu_libraries()
     chosen = [(NAMES["cuda"], dict(_CUDA_OPTIONS))]
     if provider == "tensorrt":
         chosen.insert(0, (NAMES["tensorrt"], tensorrt_options(info, options.engine_cache)))
