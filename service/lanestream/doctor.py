@@ -35,10 +35,11 @@ _WIDTH_OF_PIPES: Final = 200
     metavar="FILE|none",
     help="ONNX file of the second network, or none  [default: the shipped one]",
 )
+@click.option("--config", type=click.Path(path_type=Path), help="TOML file of settings, as for `serve`.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 @click.pass_context
 def doctor(context: click.Context, /, required: Provider | None, as_json: bool, **given: Any) -> None:
-    """Tell what networks run on here, and how fast; also settings of LANESTREAM_<NAME> count, as for a service."""
+    """Tell what networks run on here, and how fast; the settings of a service count here, too."""
     diagnosis = diagnose(load_settings(**given), required)
     if as_json:
         click.echo(json.dumps(asdict(diagnosis), indent=2))

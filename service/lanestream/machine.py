@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import platform
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import onnxruntime
-
+from lanestream.inference.providers import cuda_version, preload_gpu_libraries
 from lanestream.processors import affinity, processors, quota
 
 # Instructions that decide how fast a network is, on x86 and on ARM.
@@ -69,17 +66,11 @@ def gpu() -> Gpu:
         devices=devices,
         driver=driver,
         driver_cuda=version_of(("libcuda.so.1",), _driver_cuda),
-        onnxruntime_cuda=onnxruntime.cuda_version or None,
+        onnxruntime_cuda=cuda_version(),
         cuda=version_of(("libcudart.so.13", "libcudart.so.12"), _cuda),
         cudnn=version_of(("libcudnn.so.9",), _cudnn),
         tensorrt=version_of(("libnvinfer.so.11", "libnvinfer.so.10"), _tensorrt),
     )
-
-
-def preload_gpu_libraries() -> None:
-    """Loads CUDA and cuDNN from Python packages, where the loader would not look; what is missing is told on stderr."""
-    with contextlib.redirect_stdout(sys.stderr):
-        onnxruntime.preload_dlls()
 
 
 def version_of(

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from lanestream.errors import ModelError, ProviderError, one_line
 from lanestream.inference.model_info import ModelInfo, parse_info, require_file
 from lanestream.inference.network import LoadedNetwork, Placement
-from lanestream.inference.providers import NAMES, OnnxProvider, verify
-from lanestream.machine import preload_gpu_libraries
+from lanestream.inference.providers import NAMES, OnnxProvider, preload_gpu_libraries, verify
 from lanestream.processors import processors
 from lanestream.runtime import DEFAULT_OPTIONS, RuntimeOptions
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -47,6 +49,17 @@ class Offer:
 def offered() -> Offer:
     """What is installed here."""
     return Offer(frozenset(onnxruntime.get_available_providers()), find_spec("openvino") is not None)
+
+
+def cuda_version() -> str | None:
+    """The version of CUDA that the installed onnxruntime is built for, None where it has none."""
+    return onnxruntime.cuda_version or None
+
+
+def preload_gpu_libraries() -> None:
+    """Loads CUDA and cuDNN from Python packages, where the loader would not look; what is missing is told on stderr."""
+    with contextlib.redirect_stdout(sys.stderr):
+        onnxruntime.preload_dlls()
 
 
 def attempts(provider: Provider) -> Mapping[Loadable, str]:
