@@ -15,7 +15,7 @@ from lanestream.detection import Findings, Pipeline, Prepared
 from lanestream.engine import Engine
 from lanestream.geometry import RoadView, visible_rows
 from lanestream.lanes import Curve, Detection, Image
-from lanestream.protocol import Limits, Mode, ReadyMessage
+from lanestream.protocol import EgoModel, LanesMessage, Limits, Mode, ReadyMessage, TimingModel
 
 WAIT_S = 10.0  # far more than anything takes; a test that hangs fails instead
 
@@ -148,3 +148,12 @@ def ready(mode: Mode = "all", **other: Any) -> ReadyMessage:
 def pause(seconds: float) -> None:
     """Lets real time pass, where a limit of the service is a time."""
     time.sleep(seconds)
+
+
+def lanes(seq: int) -> LanesMessage:
+    """What a service says of a frame on which it sees no lanes."""
+    timing = TimingModel(decode=0, propose=0, queue=0, infer=0, track=0, total=0)
+    ego = EgoModel(left=None, right=None, offset=None)
+    return LanesMessage(
+        seq=seq, timestamp=0, width=9, height=9, horizon=1, lanes=[], ego=ego, events=[], dropped=0, timing_ms=timing
+    )

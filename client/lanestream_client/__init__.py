@@ -3,7 +3,7 @@
 from lanestream.protocol import CameraModel
 from lanestream_client.async_client import AsyncLaneClient, AsyncLaneStream
 from lanestream_client.client import LaneClient, LaneStream
-from lanestream_client.frames import SourceFrame, StreamResult
+from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
 
 __all__ = [
     "AsyncLaneClient",
@@ -13,4 +13,5 @@ __all__ = [
     "LaneStream",
     "SourceFrame",
     "StreamResult",
+    "StreamSummary",
 ]

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lanestream.errors import ImageError, SourceError, needs_extra
+from lanestream.errors import ImageError, LanestreamError, LostError, SourceError, needs_extra
 from lanestream.protocol import camera_of
 from lanestream.runtime import PROVIDERS
 from lanestream_client.client import LaneClient
@@ -24,6 +25,8 @@ from lanestream_client.in_process import InProcess, LocalEngine
 from lanestream_client.live import NewestFrames
 from lanestream_client.report import Tally
 from lanestream_client.requests import image_bytes
+from lanestream_client.route import Patience
+from lanestream_client.service import ServiceInfo
 from lanestream_client.sinks import json_lines, video_sink
 from lanestream_client.sources import image_files, open_source
 
@@ -41,7 +44,18 @@ _INTERRUPTED = 130
 
 def _service_options(command: _Command) -> _Command:
     options = [
-        click.option("--url", help="Service to ask, such as http://127.0.0.1:8000  [default: work in this process]"),
+        click.option(
+            "--url",
+            multiple=True,
+            help="Service to ask, such as http://127.0.0.1:8000; each of its replicas  [default: work in this process]",
+        ),
+        click.option(
+            "--api-key",
+            envvar="LANESTREAM_API_KEY",
+            show_envvar=True,
+            metavar="KEY",
+            help="What opens the service, where it asks for a key.",
+        ),
         click.option("--model", type=click.Path(path_type=Path), help="ONNX file to run in this process."),
         click.option(
             "--regressor",
@@ -138,6 +152,13 @@ def detect(
 @click.option(
     "--fps", type=click.FloatRange(0.1, 1000.0), default=25.0, show_default=True, help="Rate of a folder of images."
 )
+@click.option(
+    "--reconnect",
+    type=click.FloatRange(min=0.0),
+    metavar="SECONDS",
+    help="How long a lost connection is sought; 0 is not at all  [default: 30]",
+)
+@click.option("--session", metavar="NAME", help="A name for the stream in the service's logs.")
 @click.pass_context
 def stream(
     context: click.Context,
@@ -151,6 +172,7 @@ def stream(
     mode: Mode | None,
     video: Path | None,
     fps: float,
+    session: str | None,
     **where: Any,
 ) -> None:
     """Follow the lanes of one camera.
@@ -158,15 +180,22 @@ def stream(
     SOURCE is a video file, a folder of images, a camera number or an rtsp:// or http:// URL.
     """
     model = camera_of(camera_height, field_of_view)
+    if session is not None and not where["url"]:
+        raise click.UsageError("--session is for the service at --url")
     with ExitStack() as stack:
         camera = stack.enter_context(open_source(source, fps))
         service = stack.enter_context(_service(context.obj, **where))
         lines = stack.enter_context(json_lines(jsonl))
         outputs = _Outputs(lines, stack.enter_context(video_sink(video, camera.fps)))
         mode = mode or ("latest" if camera.live else "all")
-        follow = partial(service.stream, mode=mode, horizon=horizon, detector=detector, camera=model)
-        interrupted = _follow(follow, camera, outputs, mode)
-        click.echo(outputs.tally.report(service.describe(detector), outputs.dropped), err=_is_output(jsonl))
+        follow = partial(service.stream, mode=mode, horizon=horizon, detector=detector, camera=model, session=session)
+        try:
+            interrupted = _follow(follow, camera, outputs, mode)
+        except LanestreamError:
+            if outputs.tally.frames:
+                click.echo(outputs.report(service, detector), err=_is_output(jsonl))
+            raise
+        click.echo(outputs.report(service, detector), err=_is_output(jsonl))
     context.exit(_INTERRUPTED if interrupted else 0)
 
 
@@ -176,6 +205,8 @@ class _Outputs:
     def __init__(self, lines: JsonLines | None, video: VideoSink | None) -> None:
         self.tally = Tally()
         self.dropped = 0
+        self.info: ServiceInfo | None = None
+        self._reconnects = 0
         self._lines = lines
         self._video = video
 
@@ -184,13 +215,27 @@ class _Outputs:
         if result.lanes is not None:
             self.tally.answered(result.lanes)
         elif result.error is not None:
-            self.tally.fail()
+            self.tally.fail(lost=result.error.code == LostError.code)
             click.echo(f"frame {result.frame.seq}: {result.error.message}", err=True)
         message = result.lanes or result.error
         if self._lines is not None and message is not None:
             self._lines.write(message, **({"file": result.frame.name} if result.frame.name else {}))
         if self._video is not None:
             self._draw(result, self._video)
+
+    def watch(self, results: ResultStream) -> None:
+        """Keeps what the stream knows of the service, and says so where its connection was lost and is back."""
+        if (ready := results.ready) is None:
+            return
+        self.info = ServiceInfo(ready.model, ready.provider)
+        if results.reconnects > self._reconnects:
+            self._reconnects = results.reconnects
+            how = "goes on" if ready.resumed else "begins afresh, with new track ids"
+            click.echo(f"the connection was lost and is back: session {ready.session} {how}", err=True)
+
+    def report(self, service: LaneService, detector: DetectorName | None) -> str:
+        """The closing lines; a service that has said what it runs may be gone by now."""
+        return self.tally.report(self.info or service.describe(detector), self.dropped)
 
     def _draw(self, result: StreamResult, video: VideoSink) -> None:
         from lanestream_client.overlays import draw_error, draw_lanes
@@ -216,26 +261,36 @@ def _follow(stream: Callable[..., ResultStream], camera: Source, outputs: _Outpu
         try:
             with closing(iter(results)) as each:
                 for result in each:
+                    outputs.watch(results)
                     outputs.take(result)
                     advance()
+            outputs.watch(results)
         except KeyboardInterrupt:
             interrupted = True
-    outputs.dropped = (results.summary.dropped if results.summary else 0) + (newest.skipped if newest else 0)
+        finally:
+            outputs.dropped = (results.summary.dropped if results.summary else 0) + (newest.skipped if newest else 0)
     return interrupted
 
 
 @contextmanager
 def _service(
-    load: Load, url: str | None, model: Path | None, provider: str | None, regressor: Path | None
+    load: Load,
+    url: tuple[str, ...],
+    api_key: str | None,
+    reconnect: float | None = None,
+    **local: Any,
 ) -> Iterator[LaneService]:
-    if url is None:
-        yield InProcess(load(model, provider or "auto", regressor))
+    if not url:
+        key_was_given = click.get_current_context().get_parameter_source("api_key") is ParameterSource.COMMANDLINE
+        if key_was_given or reconnect is not None:
+            raise click.UsageError("--api-key and --reconnect are for the service at --url")
+        yield InProcess(load(local["model"], local["provider"] or "auto", local["regressor"]))
         return
-    if any(option is not None for option in (model, provider, regressor)):
+    if any(option is not None for option in local.values()):
         raise click.UsageError(
             "--model, --regressor and --provider are for work in this process; the service at --url has its own"
         )
-    with LaneClient(url) as client:
+    with LaneClient(url, api_key=api_key, reconnect_s=Patience.total_s if reconnect is None else reconnect) as client:
         yield client
 
 

@@ -61,3 +61,19 @@ class StreamResult:
     frame: SourceFrame
     lanes: LanesMessage | None = None
     error: ErrorMessage | None = None
+
+
+@dataclass(frozen=True)
+class StreamSummary:
+    """What became of the frames of a stream, over all its connections.
+
+    `frames` counts those that the source gave, each of them answered, failed, dropped or lost: `dropped` for a newer
+    one, `lost` with a connection. `duration_s` runs from the first `ready` on.
+    """
+
+    frames: int
+    answered: int
+    failed: int
+    dropped: int
+    lost: int
+    duration_s: float

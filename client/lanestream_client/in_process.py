@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from lanestream.errors import LanestreamError
-from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, SummaryMessage, error_message
-from lanestream_client.frames import SourceFrame, StreamResult
+from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage, error_message
+from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
 from lanestream_client.requests import image_bytes
 from lanestream_client.service import ServiceInfo, as_frames
 
@@ -83,17 +83,24 @@ class InProcess:
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        session: str | None = None,
     ) -> LocalStream:
         """The lanes of the frames of one camera. In either mode a frame is taken when the one before is done.
 
         Raises NoDetectorError where `detector` is not loaded.
         """
-        del mode  # nothing waits here that a newer frame could replace
+        del mode, session  # nothing waits here that a newer frame could replace, and no log tells streams apart
         return LocalStream(self._engine.open_camera(horizon, detector, camera), as_frames(frames))
 
 
 class LocalStream:
-    """The results of one stream, to be iterated over once; `summary` is there afterwards."""
+    """The results of one stream, to be iterated over once; `summary` is there afterwards.
+
+    No service had to be `ready`, and no connection is ever lost.
+    """
+
+    ready: ReadyMessage | None = None
+    reconnects: int = 0
 
     def __init__(
         self, camera: Camera, frames: Iterator[SourceFrame], clock: Callable[[], float] = time.monotonic
@@ -101,7 +108,7 @@ class LocalStream:
         self._camera = camera
         self._frames = frames
         self._clock = clock
-        self.summary: SummaryMessage | None = None
+        self.summary: StreamSummary | None = None
 
     def __iter__(self) -> Generator[StreamResult]:
         started = self._clock()
@@ -117,10 +124,11 @@ class LocalStream:
             else:
                 answered += 1
                 yield StreamResult(frame, lanes=lanes)
-        self.summary = SummaryMessage(
+        self.summary = StreamSummary(
             frames=answered + failed,
             answered=answered,
             failed=failed,
             dropped=0,
+            lost=0,
             duration_s=round(self._clock() - started, 3),
         )

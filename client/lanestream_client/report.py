@@ -22,23 +22,33 @@ class Tally:
         self._timings: list[TimingModel] = []
         self._with_both = 0
         self.failed = 0
+        self.lost = 0
 
     def answered(self, lanes: LanesMessage) -> None:
         """One frame has its lanes."""
         self._timings.append(lanes.timing_ms)
         self._with_both += lanes.ego.left is not None and lanes.ego.right is not None
 
-    def fail(self) -> None:
-        """One frame has none, but an error."""
-        self.failed += 1
+    def fail(self, *, lost: bool = False) -> None:
+        """One frame has none, but an error; `lost` where its answer was lost on the way."""
+        if lost:
+            self.lost += 1
+        else:
+            self.failed += 1
+
+    @property
+    def frames(self) -> int:
+        """How many came back, with or without lanes."""
+        return len(self._timings) + self.failed + self.lost
 
     def report(self, info: ServiceInfo, dropped: int = 0) -> str:
         """The closing lines."""
         answered = len(self._timings)
         rate = answered / max(time.monotonic() - self._started, 1e-9)
+        lost = f", {self.lost} lost" if self.lost else ""
         lines = [
-            f"{answered + self.failed + dropped} frames: {answered} answered, {dropped} dropped, {self.failed} failed; "
-            f"{rate:.1f} frames/s"
+            f"{self.frames + dropped} frames: "
+            f"{answered} answered, {dropped} dropped, {self.failed} failed{lost}; {rate:.1f} frames/s"
         ]
         if answered:
             lines += [f"both ego boundaries in {100.0 * self._with_both / answered:.1f} % of the answered frames", ""]

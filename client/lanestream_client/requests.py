@@ -6,12 +6,12 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.client import responses
 from pathlib import Path
 from typing import Any
 
 import httpx
 from pydantic import ValidationError
-from websockets.exceptions import InvalidStatus
 
 from lanestream.errors import (
     ConnectionFailedError,
@@ -21,7 +21,7 @@ from lanestream.errors import (
     SourceError,
     error_of,
 )
-from lanestream.protocol import CameraModel, DetectorName, LanesMessage
+from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, StartMessage, parse_client_message
 from lanestream_client.service import ServiceInfo
 
 
@@ -73,25 +73,17 @@ def checked(response: httpx.Response) -> httpx.Response:
     """The answer, where it is a good one. Raises the error that the service told."""
     if response.is_success:
         return response
-    raise _told(response)
+    raise refused(response.status_code, response.content, str(response.url.copy_with(userinfo=b"")))
 
 
-def refused(place: str, error: InvalidStatus) -> LanestreamError:
-    """The error that the service told when it refused a stream's handshake."""
-    response = error.response
-    return _problem(response.body or b"", place, f"{response.status_code} {response.reason_phrase}")
-
-
-def _told(response: httpx.Response) -> LanestreamError:
-    return _problem(response.content, str(response.url), f"{response.status_code} {response.reason_phrase}")
-
-
-def _problem(body: bytes | bytearray, place: str, status: str) -> LanestreamError:
+def refused(status: int, body: bytes | bytearray, place: str) -> LanestreamError:
+    """The error in an answer that is no good one: as the service told it, or else what its status says."""
     try:
         problem: dict[str, Any] = json.loads(body)
-        return error_of(problem["code"], problem["message"], problem["hint"])
+        return error_of(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
     except (ValueError, TypeError, KeyError):
-        return ConnectionFailedError(f"{place} answered {status.rstrip()}", "is this a Lanestream service?")
+        answer = f"{status} {responses.get(status, '')}".rstrip()
+        return ConnectionFailedError(f"{place} answered {answer}", "is this a Lanestream service?")
 
 
 @contextmanager
@@ -105,5 +97,24 @@ def reaching(place: str) -> Iterator[None]:
 
 def unreachable(place: str, error: Exception) -> ConnectionFailedError:
     """The error for a service that can't be reached."""
-    reason = re.sub(r"^\[Errno -?\d+\] ", "", str(error)) or type(error).__name__
+    timed_out = isinstance(error, TimeoutError | httpx.TimeoutException)
+    reason = "no answer in time" if timed_out else re.sub(r"^\[Errno -?\d+\] ", "", str(error))
+    reason = reason or type(error).__name__
     return ConnectionFailedError(f"can't reach the service at {place}: {reason}", "start one with `lanestream serve`")
+
+
+def start(
+    mode: Mode, horizon: float | None, detector: DetectorName | None, camera: CameraModel | None, session: str | None
+) -> StartMessage:
+    """What opens a stream. Raises ProtocolError where something is asked for that is none."""
+    asked = {
+        "type": "start",
+        "mode": mode,
+        "horizon": horizon,
+        "detector": detector,
+        "camera": None if camera is None else camera.model_dump(),
+        "session": session,
+    }
+    message = parse_client_message(json.dumps(asked))
+    assert isinstance(message, StartMessage)  # noqa: S101 - its type says so
+    return message

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, SummaryMessage
-from lanestream_client.frames import SourceFrame, StreamResult
+from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage
+from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,17 @@ class ResultStream(Protocol):
     """The results of a stream as they come; afterwards the summary."""
 
     @property
-    def summary(self) -> SummaryMessage | None:
+    def ready(self) -> ReadyMessage | None:
+        """What the service said when it opened the stream last; None before, and where no service is needed."""
+        ...
+
+    @property
+    def reconnects(self) -> int:
+        """How often the stream was opened again after its connection was lost."""
+        ...
+
+    @property
+    def summary(self) -> StreamSummary | None:
         """The final count; None until the stream came to its end."""
         ...
 
@@ -56,8 +66,9 @@ class LaneService(Protocol):
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        session: str | None = None,
     ) -> ResultStream:
-        """The lanes of the frames of one camera."""
+        """The lanes of the frames of one camera; `session` names it in a service's logs."""
         ...
 
 

@@ -17,10 +17,12 @@ import fakes
 import httpx
 import numpy as np
 import pytest
+from scripted import Visit, refused_url, scripted
 
 from lanestream import cli
 from lanestream.api.server import listen
 from lanestream.engine import Engine
+from lanestream.errors import UnauthorizedError
 from lanestream.local import LocalEngine
 from lanestream_client.sinks import video_sink
 
@@ -122,6 +124,68 @@ def test_stream_through_a_service(run: Run, clip: Path, url: str, mode: str) -> 
     assert code == 0
     assert "10 frames: 10 answered" in output
     assert "model fake 1 on cpu" in output
+
+
+def test_a_stream_over_replicas_says_what_its_connection_cost(run: Run, clip: Path) -> None:
+    def breaking(visit: Visit) -> None:
+        visit.open()
+        assert visit.frame() == 0
+        visit.break_off()
+
+    def resumed(visit: Visit) -> None:
+        visit.open(session="cam-7", resumed=True, last_seq=0)
+        visit.finish()
+
+    with scripted(breaking, resumed) as script:
+        code, output, errors = run("stream", clip, "--url", refused_url(), "--url", script.url, "--session", "cam-7")
+    assert code == 0
+    assert errors.splitlines() == [
+        "the connection was lost and is back: session cam-7 goes on",
+        "frame 0: the answer to this frame was lost with the connection",
+    ]
+    assert "10 frames: 9 answered, 0 dropped, 0 failed, 1 lost; " in output
+    assert "model m on cpu" in output
+    assert [start["session"] for start in script.starts] == ["cam-7"] * 2
+
+
+def test_a_stream_that_can_not_go_on_is_summed_up_first(run: Run, clip: Path) -> None:
+    def breaking(visit: Visit) -> None:
+        visit.open()
+        visit.answer(visit.frame())
+        assert visit.frame() == 1
+        visit.close(1012)
+
+    with scripted(breaking) as script:
+        code, output, errors = run("stream", clip, "--url", script.url, "--reconnect", "0")
+    assert code == 1
+    assert "1 answered, 0 dropped, 0 failed, " in output
+    assert errors.splitlines()[-1] == "error: the service closed the stream with code 1012"
+
+
+@pytest.mark.parametrize("way", ["option", "environment"])
+def test_a_key_is_sent_and_not_shown(run: Run, clip: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    if way == "environment":
+        monkeypatch.setenv("LANESTREAM_API_KEY", "hidden-key")
+    with scripted(UnauthorizedError("no such key", "ask for one")) as script:
+        key = ["--api-key", "hidden-key"] if way == "option" else []
+        code, output, errors = run("stream", clip, "--url", script.url, *key)
+    assert (code, output, errors) == (1, "", "error: no such key (ask for one)\n")
+    assert script.headers[0]["Authorization"] == "Bearer hidden-key"
+    code, output, errors = run("stream", clip, "--url", script.url, "--api-key", "hidden key")
+    assert (code, "the API key is none" in errors, "hidden" in output + errors) == (1, True, False)
+
+
+def test_a_key_in_the_environment_is_no_matter_in_process(
+    run: Run, clip: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LANESTREAM_API_KEY", "hidden-key")
+    assert run("stream", clip)[0] == 0
+
+
+@pytest.mark.parametrize("options", [("--api-key", "k"), ("--reconnect", "1"), ("--session", "cam-7")])
+def test_options_about_a_service_need_one(run: Run, clip: Path, options: tuple[str, str]) -> None:
+    code, _, errors = run("stream", clip, *options)
+    assert (code, "for the service at --url" in errors) == (2, True)
 
 
 @pytest.mark.parametrize(("detector", "count", "model"), [("candidates", 2, "fake 1"), ("regression", 1, "other 2")])

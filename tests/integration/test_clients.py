@@ -271,13 +271,17 @@ READY = fakes.ready()
 @pytest.mark.parametrize("said", [(), (READY.model_dump_json(),)])
 def test_a_service_that_goes_away_is_told(said: tuple[str, ...]) -> None:
     told = "closed the stream with code 1012: restarting"
-    with dying(*said) as place, LaneClient(place) as client, pytest.raises(ConnectionFailedError, match=told):
+    with (
+        dying(*said) as place,
+        LaneClient(place, reconnect_s=0.0) as client,
+        pytest.raises(ConnectionFailedError, match=told),
+    ):
         list(client.stream(frames(100), mode="all"))
 
 
 async def test_a_service_that_goes_away_is_told_to_the_awaiting_client() -> None:
     with dying(READY.model_dump_json()) as place:
-        async with AsyncLaneClient(place) as client:
+        async with AsyncLaneClient(place, reconnect_s=0.0) as client:
             with pytest.raises(ConnectionFailedError, match="1012"):
                 _ = [result async for result in client.stream(frames(100), mode="all")]
 

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
-import subprocess
-import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import fakes
 import httpx
 import pytest
+from processes import service
 from redisserver import redis_server
 from talking import closed, heard, stream, tell
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -27,26 +24,6 @@ from lanestream.settings import Settings
 
 CREDITS = 4
 STREAMS = 4
-
-
-@contextmanager
-def service(**settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A service in a process of its own, ready, and its URL."""
-    environment = {f"LANESTREAM_{name.upper()}": str(value) for name, value in settings.items()}
-    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
-    with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env={**os.environ, **environment}
-    ) as process:
-        try:
-            assert process.stderr is not None
-            url = ""
-            for line in process.stderr:
-                url = url or "".join(re.findall(r"listening on (\S+),", line))
-                if line.rstrip().endswith(" ready"):
-                    break
-            yield process, url
-        finally:
-            process.kill()
 
 
 @dataclass

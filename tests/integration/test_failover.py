@@ -1,0 +1,180 @@
+"""Streams of the clients over real services that break, stop or are killed."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import fakes
+import numpy as np
+import pytest
+from processes import service
+from redisserver import redis_server
+
+from lanestream.protocol import EgoModel
+from lanestream_client import LaneClient, SourceFrame, StreamResult
+from lanestream_exporter.scenes import Drive, render_clip, sample_clip
+
+Serve = Callable[..., str]
+STREAMS = 4
+IN_FLIGHT = 2
+
+
+class Relay:
+    """Passes connections on to a service, until they are cut."""
+
+    def __init__(self, listener: socket.socket, url: str) -> None:
+        host, _, port = url.removeprefix("http://").partition(":")
+        self._target = (host, int(port))
+        self._listener = listener
+        self._sockets: list[socket.socket] = []
+        self.url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+
+    def run(self) -> None:
+        with suppress(OSError):  # when it is closed
+            while True:
+                ends = [self._listener.accept()[0], socket.create_connection(self._target)]
+                self._sockets += ends
+                for source, sink in (ends, ends[::-1]):
+                    threading.Thread(target=self._pass_on, args=(source, sink)).start()
+
+    def cut(self) -> None:
+        """Breaks the connections that there are."""
+        for end in self._sockets:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+        self._sockets.clear()
+
+    @staticmethod
+    def _pass_on(source: socket.socket, sink: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(65536):
+                sink.sendall(data)
+        with suppress(OSError):
+            sink.shutdown(socket.SHUT_RDWR)
+
+
+@contextmanager
+def relayed(url: str) -> Iterator[Relay]:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        relay = Relay(listener, url)
+        thread = threading.Thread(target=relay.run)
+        thread.start()
+        try:
+            yield relay
+        finally:
+            relay.cut()
+            listener.shutdown(socket.SHUT_RDWR)
+            thread.join(fakes.WAIT_S)
+
+
+def frames(count: int, picture: bytes | None = None) -> Iterator[SourceFrame]:
+    data = picture or fakes.image_file()
+    return (SourceFrame(seq, 0.04 * seq, data=data) for seq in range(count))
+
+
+def ids(results: list[StreamResult]) -> set[int]:
+    return {lane.track_id for result in results if result.lanes is not None for lane in result.lanes.lanes}
+
+
+@pytest.mark.parametrize("mode", ["all", "latest"])
+def test_ids_go_on_over_broken_connections(url: str, mode: str) -> None:
+    with relayed(url) as relay, LaneClient(relay.url, in_flight=3) as client:
+        stream = client.stream(frames(60), mode=mode, session="cut-off")
+        results = []
+        for result in stream:
+            results.append(result)
+            if len(results) in (20, 40):
+                relay.cut()
+    numbers = [result.frame.seq for result in results]
+    assert numbers == sorted(set(numbers))
+    assert stream.reconnects == 2
+    assert stream.ready is not None
+    assert (stream.ready.resumed, stream.ready.session) == (True, "cut-off")
+    assert ids(results) == {1, 2}
+    total = stream.summary
+    assert total is not None
+    assert (total.frames, total.dropped) == (60, 60 - len(results))
+    assert mode == "latest" or total.dropped == 0
+    assert {result.error.code for result in results if result.error} <= {"lost"}
+
+
+@pytest.fixture(scope="module")
+def road() -> bytes:
+    """A rendered highway, which stands still."""
+    clip = sample_clip(np.random.default_rng(24), 640, 360, frames=1, fps=25.0, drive=Drive("highway", fair=True))
+    (frame,) = render_clip(clip)
+    return cv2.imencode(".jpg", frame.image)[1].tobytes()
+
+
+@dataclass
+class Camera:
+    """A client in mode `all` that streams a picture over whichever replica is there, until it was told enough."""
+
+    urls: list[str]
+    picture: bytes
+    under_way: threading.Barrier
+    enough: threading.Event
+    results: list[StreamResult] = field(default_factory=list)
+    egos: list[EgoModel] = field(default_factory=list)
+    frames: int = 0
+
+    def run(self) -> None:
+        with LaneClient(self.urls, in_flight=IN_FLIGHT) as client:
+            stream = client.stream(self._source(), mode="all")
+            for result in stream:
+                self.results.append(result)
+                if len(self.results) == 10:
+                    self.under_way.wait(3 * fakes.WAIT_S)
+                if result.lanes is not None and stream.reconnects == len(self.egos) - 1:
+                    self.egos[-1] = result.lanes.ego
+                elif result.lanes is not None:
+                    self.egos.append(result.lanes.ego)
+                    assert stream.ready is not None
+                    assert stream.ready.resumed == (stream.reconnects > 0)
+                    if stream.reconnects:
+                        self.under_way.wait(3 * fakes.WAIT_S)
+            assert stream.summary is not None
+            assert stream.summary.frames == stream.summary.answered + stream.summary.lost
+
+    def _source(self) -> Iterator[SourceFrame]:
+        for frame in frames(100_000, self.picture):
+            if self.enough.is_set():
+                return
+            self.frames += 1
+            yield frame
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM], ids=["killed", "drained"])
+def test_every_stream_goes_on_at_the_other_replica(tmp_path: Path, road: bytes, end: signal.Signals) -> None:
+    with (
+        redis_server(tmp_path) as redis_url,
+        service(redis_url=redis_url, regressor="none") as (process, one),
+        service(redis_url=redis_url, regressor="none") as (_, other),
+    ):
+        under_way, enough = threading.Barrier(STREAMS + 1), threading.Event()
+        cameras = [Camera([one, other], road, under_way, enough) for _ in range(STREAMS)]
+        threads = [threading.Thread(target=camera.run) for camera in cameras]
+        for thread in threads:
+            thread.start()
+        under_way.wait(3 * fakes.WAIT_S)
+        process.send_signal(end)
+        under_way.wait(3 * fakes.WAIT_S)
+        enough.set()
+        for thread in threads:
+            thread.join(3 * fakes.WAIT_S)
+    for camera in cameras:
+        before, after = camera.egos
+        assert None not in (before.left, before.right)
+        assert (after.left, after.right) == (before.left, before.right)
+        assert [result.frame.seq for result in camera.results] == list(range(camera.frames))
+        lost = [result.error.code for result in camera.results if result.error is not None]
+        assert set(lost) <= {"lost"}
+        assert len(lost) <= (IN_FLIGHT if end is signal.SIGKILL else 0)

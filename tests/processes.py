@@ -1,0 +1,30 @@
+"""Services in processes of their own, which can be stopped and killed."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def service(**settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A service in a process of its own, ready, and its URL."""
+    environment = {f"LANESTREAM_{name.upper()}": str(value) for name, value in settings.items()}
+    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env={**os.environ, **environment}
+    ) as process:
+        try:
+            assert process.stderr is not None
+            url = ""
+            for line in process.stderr:
+                url = url or "".join(re.findall(r"listening on (\S+),", line))
+                if line.rstrip().endswith(" ready"):
+                    break
+            yield process, url
+        finally:
+            process.kill()
