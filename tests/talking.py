@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import fakes
+import httpx
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -51,3 +53,11 @@ def all_was_read(socket: ClientConnection) -> None:
     """Returns when the service has taken in all that was sent before: it answers text at once, and in order."""
     socket.send("?")
     assert heard(socket)["code"] == "bad_message"
+
+
+def all_released(url: str, **headers: str) -> None:
+    """Returns when no stream has a session any more: a service lets go of one after its client is gone."""
+    ends = time.monotonic() + fakes.WAIT_S
+    while "lane_sessions_active 0.0" not in httpx.get(f"{url}/metrics", headers=headers).text:
+        assert time.monotonic() < ends
+        time.sleep(0.005)

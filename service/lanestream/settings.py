@@ -50,7 +50,15 @@ def _origins(value: object) -> object:
     for origin in origins:
         if not _ORIGIN.fullmatch(origin):
             raise ValueError(f"{origin!r} is no origin; scheme://host or scheme://host:port is accepted")
-    return origins
+    return tuple(_without_default_port(origin) for origin in origins)
+
+
+def _without_default_port(origin: str) -> str:
+    """The origin as browsers tell it."""
+    for scheme, port in (("http://", ":80"), ("https://", ":443")):
+        if origin.startswith(scheme):
+            return origin.removesuffix(port)
+    return origin
 
 
 def _texts(value: object) -> list[str]:

@@ -15,6 +15,7 @@ import fakes
 import httpx
 import pytest
 from fastapi.routing import APIRoute
+from talking import all_released
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -260,8 +261,8 @@ def start(socket: ClientConnection, **more: str) -> dict[str, Any]:
 
 
 def test_sessions_belong_to_a_key_and_are_counted_by_it(serve: Serve) -> None:
-    url = serve(fakes.engine(), api_keys=f"{KEY},{OTHER_KEY}", max_sessions_per_caller=1).replace("http", "ws")
-    place = f"{url}/v1/stream"
+    url = serve(fakes.engine(), api_keys=f"{KEY},{OTHER_KEY}", max_sessions_per_caller=1)
+    place = f"{url.replace('http', 'ws')}/v1/stream"
     with connect(place, additional_headers=bearer(TOKEN)) as mine:
         token = start(mine)["resume_token"]
         with connect(place, additional_headers=bearer(TOKEN)) as second:
@@ -270,6 +271,7 @@ def test_sessions_belong_to_a_key_and_are_counted_by_it(serve: Serve) -> None:
             assert start(theirs, resume_token=token)["resumed"] is False
         mine.send(fakes.image_file())
         assert json.loads(mine.recv(fakes.WAIT_S))["type"] == "lanes", "and mine goes on"
+    all_released(url, **bearer(TOKEN))
     with connect(place, additional_headers=bearer(TOKEN)) as again:
         assert start(again, resume_token=token)["resumed"] is True
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,8 +11,7 @@ import fakes
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from talking import all_released, all_was_read, closed, heard, stream, tell
 
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR
 
@@ -107,29 +104,26 @@ def test_the_shipped_networks_are_told_by_their_files(real_url: str) -> None:
 def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
     network = fakes.GatedNetwork()
     url = serve(fakes.engine(network))
-    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
+    with stream(url) as socket:
         socket.send(fakes.image_file())
         network.wait_for_a_frame()
         for _ in range(4):
             socket.send(fakes.image_file())
-        socket.send("?")
-        assert json.loads(socket.recv(fakes.WAIT_S))["code"] == "bad_message"
+        all_was_read(socket)
         found = samples(url)
         assert value(found, "lane_sessions_active") == 1
         assert value(found, "lane_frames_received_total") == 5
         assert value(found, "lane_frames_dropped_total", reason="superseded") == 3
         assert value(found, "lane_frames_processed_total") == 0
         network.let_through(2)
-        for _ in range(2):
-            assert json.loads(socket.recv(fakes.WAIT_S))["type"] == "lanes"
+        assert [heard(socket)["type"] for _ in range(2)] == ["lanes", "lanes"]
         socket.send(b"no image")
-        assert json.loads(socket.recv(fakes.WAIT_S))["code"] == "bad_image"
-        socket.send('{"type": "end"}')
-        assert json.loads(socket.recv(fakes.WAIT_S))["type"] == "summary"
-        with pytest.raises(ConnectionClosed):
-            socket.recv(fakes.WAIT_S)
+        assert heard(socket)["code"] == "bad_image"
+        tell(socket, "end")
+        assert heard(socket)["type"] == "summary"
+        assert closed(socket)[0] == 1000
+    all_released(url)
     found = samples(url)
-    assert value(found, "lane_sessions_active") == 0
     assert value(found, "lane_frames_processed_total") == value(found, "lane_frame_age_seconds_count") == 2
     assert value(found, "lane_frames_dropped_total", reason="decode_error") == 1
     assert value(found, "lane_refusals_total", code="bad_message") == 1
@@ -142,18 +136,14 @@ def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
 def test_frames_whose_client_is_gone_are_counted_too(serve: Serve) -> None:
     network = fakes.GatedNetwork()
     url = serve(fakes.engine(network))
-    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
-        socket.send('{"type": "start", "mode": "all"}')
-        socket.recv(fakes.WAIT_S)
+    with stream(url, mode="all") as socket:
         for _ in range(3):
             socket.send(fakes.image_file())
         network.wait_for_a_frame()
-        socket.send("?")
-        socket.recv(fakes.WAIT_S)
+        all_was_read(socket)
     network.let_through(3)
-    ends = time.monotonic() + fakes.WAIT_S
-    while value(found := samples(url), "lane_sessions_active") and time.monotonic() < ends:
-        time.sleep(0.01)
+    all_released(url)
+    found = samples(url)
     assert value(found, "lane_frames_received_total") == 3
     assert value(found, "lane_frames_dropped_total", reason="disconnected") == 3
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import fakes
 import pytest
-from talking import all_was_read, closed, heard, stream, tell
+from talking import all_released, all_was_read, closed, heard, stream, tell
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -294,6 +294,7 @@ def test_a_client_that_goes_away_in_the_middle_of_a_frame_frees_its_place(serve:
         socket.send(fakes.image_file())
         network.wait_for_a_frame()
     network.let_through(2)
+    all_released(place)
     with stream(place) as next_one:
         next_one.send(fakes.image_file())
         assert heard(next_one)["type"] == "lanes"

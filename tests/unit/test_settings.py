@@ -54,7 +54,7 @@ def test_keys_are_a_text_or_a_list(value: Any) -> None:
 
 def test_lists_come_from_variables_and_from_a_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text(f'api_keys = ["a:{DIGEST}"]\n')
-    monkeypatch.setenv("LANESTREAM_ALLOWED_ORIGINS", "https://Example.com, http://localhost:3000")
+    monkeypatch.setenv("LANESTREAM_ALLOWED_ORIGINS", "https://Example.com:443, http://localhost:3000")
     found = load_settings(config=file)
     assert found.api_keys == (ApiKey("a", DIGEST),)
     assert found.allowed_origins == ("https://example.com", "http://localhost:3000")
