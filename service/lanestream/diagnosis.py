@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import statistics
 import time
@@ -30,7 +29,8 @@ _ROUNDS: Final = 9
 class NetworkReport:
     """A loaded network: what its file is, what runs it and why, and how long it takes.
 
-    `nodes` counts the graph's nodes by what runs them. `run_ms` are median milliseconds of a run by batch size.
+    It `fell_back` where a better provider is installed and can't be used. `nodes` counts the graph's nodes by what
+    runs them. `run_ms` are median milliseconds of a run by batch size.
     """
 
     file: str
@@ -40,6 +40,7 @@ class NetworkReport:
     precision: str
     provider: str
     reason: str
+    fell_back: bool
     threads: int
     nodes: Mapping[str, int]
     load_ms: float
@@ -100,12 +101,13 @@ def _examined(path: Path, provider: Provider, settings: Settings) -> tuple[Loade
     placement = network.placement
     report = NetworkReport(
         file=str(path),
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        sha256=network.sha256,
         name=network.name,
         kind=network.info.kind,
         precision=network.info.precision,
         provider=placement.provider,
         reason=placement.reason,
+        fell_back=placement.fell_back,
         threads=placement.threads,
         nodes=placement.nodes,
         load_ms=1e3 * (loaded - started),

@@ -36,6 +36,7 @@ def test_the_shipped_networks_are_loaded_and_timed() -> None:
         assert network["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
         assert (network["provider"], network["precision"], network["threads"]) == ("cpu", "int8", 1)
         assert set(network["nodes"]) == {"CPU"}
+        assert not network["fell_back"]
         assert list(network["run_ms"]) == ["1", "2", "4", "8", "12", "16"]
         assert all(taken > 0.0 for taken in network["run_ms"].values())
 
