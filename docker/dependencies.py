@@ -11,8 +11,8 @@ from pathlib import Path
 
 # filterpy requires matplotlib, for plots that nobody sees here; the others came with it alone.
 UNUSED_PACKAGES = (
-    *("matplotlib", "contourpy", "cycler", "fonttools", "kiwisolver", "pillow", "pyparsing", "python-dateutil"),
-    "six",
+    *("matplotlib", "contourpy", "cycler", "fonttools"),
+    *("kiwisolver", "pillow", "pyparsing", "python-dateutil"),
 )
 # Packages bring their tests, and OpenVINO what runs on Intel's GPUs and NPUs, which a container is not given.
 UNUSED_FILES = ("**/tests", "openvino/libs/libopenvino_intel_[gn]pu_plugin.so")

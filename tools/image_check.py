@@ -35,6 +35,8 @@ from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 NAME = "lanestream-image-check"
 GUARDS = ("--read-only", "--tmpfs", "/tmp", "--cap-drop", "all", "--security-opt", "no-new-privileges")  # noqa: S108
 READY_S, STOP_S, GRACE_S = 60.0, 15.0, 20
+# Python runs by then, and the networks are not loaded yet.
+EARLY_S = 1.0
 SEED, FRAMES = 24, 50
 
 
@@ -89,7 +91,10 @@ def main(
         image = build(chosen, target, base, build_options)
         check_size(chosen, image, base, limit)
         health = check_configuration(chosen, image)
-        with running(chosen, image, (*(("--gpus", "all") if gpu else ()), *run_options)) as url:
+        options = (*(("--gpus", "all") if gpu else ()), *run_options)
+        check_early_stop(chosen, image, options)
+        with running(chosen, image, options) as url:
+            wait_until_ready(chosen, url)
             check_inside(chosen, health)
             pictures = road()
             check_answers(url, pictures)
@@ -154,14 +159,12 @@ def check_configuration(engine: Engine, image: str) -> list[str]:
 
 @contextmanager
 def running(engine: Engine, image: str, options: tuple[str, ...]) -> Iterator[str]:
-    """A container of the image with every guard on, by its URL, when it is ready; removed afterwards."""
+    """A container of the image with every guard on, by its URL, before it is ready; removed afterwards."""
     port = str(free_port())
     publish = ("-p", f"127.0.0.1:{port}:{port}", "-e", f"LANESTREAM_PORT={port}")
     engine.run("run", "--detach", "--name", NAME, *GUARDS, *publish, *options, image)
     try:
-        url = f"http://127.0.0.1:{port}"
-        wait_until_ready(engine, url)
-        yield url
+        yield f"http://127.0.0.1:{port}"
     finally:
         engine.run("rm", "--force", NAME)
 
@@ -178,6 +181,14 @@ def wait_until_ready(engine: Engine, url: str) -> None:
         time.sleep(0.2)
     log = subprocess.run([engine.command, "logs", NAME], capture_output=True, text=True, check=False)
     raise CheckError(f"not ready in {READY_S:.0f} s; its log ends\n{(log.stdout + log.stderr)[-2000:]}")
+
+
+def check_early_stop(engine: Engine, image: str, options: tuple[str, ...]) -> None:
+    """A container that ends when it is asked to while it still starts, though it is the first process in there."""
+    with running(engine, image, options):
+        time.sleep(EARLY_S)
+        took, code = stop(engine)
+    passed(f"SIGTERM while it starts: exit code {code} after {took:.1f} s")
 
 
 def check_inside(engine: Engine, health: list[str]) -> None:
@@ -229,18 +240,24 @@ def check_stop(engine: Engine, url: str, pictures: list[bytes]) -> None:
         for picture in frames:
             socket.send(picture)
         told = [json.loads(socket.recv())["type"]]
-        start = time.monotonic()
         with ThreadPoolExecutor() as pool:
-            stopping = pool.submit(engine.run, "stop", "-t", str(GRACE_S), NAME)
+            stopping = pool.submit(stop, engine)
             told += [json.loads(message)["type"] for message in received(socket)]
-            stopping.result()
-        took = time.monotonic() - start
-    code = engine.inspect("container", NAME)["State"]["ExitCode"]
-    if code not in (0, 143) or took > STOP_S:
-        raise CheckError(f"SIGTERM: exit code {code} after {took:.1f} s")
+            took, code = stopping.result()
     if told.count("lanes") != len(frames) or "draining" not in told:
         raise CheckError(f"SIGTERM with {len(frames)} frames under way: the stream was told {', '.join(told)}")
     passed(f"SIGTERM: the stream is told, its {len(frames)} frames are answered, exit code {code} after {took:.1f} s")
+
+
+def stop(engine: Engine) -> tuple[float, int]:
+    """Asks the container to end: the seconds that it took, and its exit code. Raises CheckError where it was killed."""
+    start = time.monotonic()
+    engine.run("stop", "-t", str(GRACE_S), NAME)
+    took = time.monotonic() - start
+    code: int = engine.inspect("container", NAME)["State"]["ExitCode"]
+    if code not in (0, 143) or took > STOP_S:
+        raise CheckError(f"SIGTERM: exit code {code} after {took:.1f} s")
+    return took, code
 
 
 def received(socket: ClientConnection) -> Iterator[str | bytes]:

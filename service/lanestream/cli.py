@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 _FAILED: Final = 1
 _INTERRUPTED: Final = 130
+_TERMINATED: Final = 143
+_FIRST_PROCESS: Final = 1
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,8 @@ def main() -> None:
     """Runs the command line. Errors that are raised on purpose are told in one line."""
     # What OpenCV would warn of on the side is said by the errors; it reads this once, when it is first imported.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    if os.getpid() == _FIRST_PROCESS:
+        signal.signal(signal.SIGTERM, _end)
     try:
         code = cli.main(standalone_mode=False)
         sys.stdout.flush()
@@ -159,6 +164,14 @@ def main() -> None:
     except click.Abort:
         code = _INTERRUPTED
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _end(*_: object) -> None:
+    """Does what SIGTERM does by itself, except to the first process of a container: that one would be deaf to it.
+
+    While it serves, uvicorn's handler stands in the place of this one.
+    """
+    os._exit(_TERMINATED)
 
 
 def _load_local(model: Path | None, provider: Provider, regressor: Path | None) -> LocalEngine:
