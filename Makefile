@@ -10,6 +10,7 @@ VENV := .venv
 comma := ,
 BIN := $(VENV)/bin
 VIDEO ?=
+ARGS ?=
 
 # Docker, or podman where there is no docker; the image's variant is cpu or gpu.
 ENGINE ?= $(if $(shell command -v docker),docker,podman)
@@ -21,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: evaluate proposals demo serve train-toy test lint picture image image-test up down clean
+.PHONY: bench evaluate proposals demo serve train-toy test lint picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -49,6 +50,9 @@ evaluate: $(DEV_READY)
 
 proposals: $(DEV_READY)
 	$(BIN)/python tools/proposals.py --split test --json out/proposals.json
+
+bench: $(DEV_READY)
+	PYTHONPATH=tools $(BIN)/python -m bench $(ARGS)
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
@@ -85,5 +89,5 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,train,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,train,bench,dev]'
 	@touch $@ $(RUN_READY)

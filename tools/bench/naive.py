@@ -1,0 +1,137 @@
+"""A naive lane service, in the style of the first published Hough, AlexNet and Kalman lane tracker.
+
+Receive a frame, find its lanes, send them, receive the next: in the event loop, one frame at a time. Candidates are the
+strongest lines of the extended Hough transform; for each the whole frame is masked but for 15 pixels to either side of
+the line, cropped, and scaled to 224 x 224; a full-size AlexNet in eager PyTorch judges them in one batch; the best one
+on either side is followed by a Kalman filter. The weights are random: a network's time does not depend on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import torch
+import uvicorn
+from fastapi import FastAPI, WebSocket, WebSocketDisconnect
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from lanestream.detection.edges import WORKING_WIDTH, find_edges
+from lanestream.detection.hough import ExtendedHough
+from lanestream.lanes import Image
+from lanestream_exporter.alexnet import INPUT_SIZE, AlexNet
+
+HORIZON = 0.45  # a constant of one camera, as a share of the height
+OFFSET = 15  # pixels of a frame that is 640 wide
+
+Line = tuple[float, float]  # columns at the bottom row and at the horizon
+
+
+@dataclass
+class NaiveTracker:
+    """A constant-velocity filter for the boundary on either side."""
+
+    filters: dict[str, KalmanFilter] = field(default_factory=dict)
+
+    def update(self, side: str, line: Line | None) -> Line | None:
+        """Where the boundary is now, measured or predicted."""
+        if side not in self.filters:
+            if line is None:
+                return None
+            self.filters[side] = _filter(line)
+        kalman = self.filters[side]
+        kalman.predict()
+        if line is not None:
+            kalman.update(np.array(line))
+        return float(kalman.x[0]), float(kalman.x[1])
+
+
+def _filter(line: Line) -> KalmanFilter:
+    kalman = KalmanFilter(dim_x=4, dim_z=2)
+    kalman.x = np.array([*line, 0.0, 0.0])
+    kalman.F = np.eye(4) + np.eye(4, k=2)
+    kalman.H = np.eye(2, 4)
+    kalman.P *= 100.0
+    return kalman
+
+
+def candidate_lines(image: Image, most: int) -> list[Line]:
+    """The strongest Hough lines, in pixels of the image."""
+    scale = WORKING_WIDTH / image.shape[1]
+    grey = np.asarray(cv2.cvtColor(cv2.resize(image, None, fx=scale, fy=scale), cv2.COLOR_BGR2GRAY), np.uint8)
+    top, bottom = int(HORIZON * grey.shape[0]), grey.shape[0] - 1
+    lines = ExtendedHough(limit=most).lines(find_edges(grey, top), grey.shape[1], bottom)
+    tops = lines.x_bottom + lines.slope * (top - bottom)
+    return [(float(x) / scale, float(t) / scale) for x, t in zip(lines.x_bottom, tops, strict=True)]
+
+
+def masked_patch(image: Image, line: Line) -> Image:
+    """The frame masked but for the line's strip, cropped to it and scaled."""
+    height, width = image.shape[:2]
+    offset, top = OFFSET * width / WORKING_WIDTH, HORIZON * height
+    near, far = line
+    strip = [(near - offset, height), (near + offset, height), (far + offset, top), (far - offset, top)]
+    corners = np.clip(np.array(strip), (-4.0 * width, 0.0), (5.0 * width, height)).astype(np.int32)
+    mask = np.zeros(image.shape, np.uint8)
+    cv2.fillPoly(mask, [corners], (1, 1, 1))
+    masked = image * mask
+    left, right = np.clip((corners[:, 0].min(), corners[:, 0].max()), 0, width)
+    crop = masked[int(top) :, left : max(right, left + 1)] if left < width else masked[int(top) :]
+    return np.asarray(cv2.resize(crop, (INPUT_SIZE, INPUT_SIZE)), np.uint8)
+
+
+@torch.inference_mode()
+def lane_probabilities(network: AlexNet, patches: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The network's word on each patch (N, 224, 224, 3)."""
+    inputs = torch.from_numpy(patches).permute(0, 3, 1, 2).float() / 255.0
+    probabilities: NDArray[np.float32] = torch.softmax(network(inputs), dim=1)[:, 1].numpy()
+    return probabilities
+
+
+def find_lanes(network: AlexNet, tracker: NaiveTracker, data: bytes, most: int) -> dict[str, Line | None]:
+    """The two boundaries of the ego lane in an image file."""
+    image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+    lines = candidate_lines(image, most)
+    best: dict[str, Line] = {}
+    if lines:
+        patches = np.stack([masked_patch(image, line) for line in lines])
+        for index in np.argsort(lane_probabilities(network, patches)):
+            best["left" if lines[index][0] < image.shape[1] / 2 else "right"] = lines[index]
+    return {side: tracker.update(side, best.get(side)) for side in ("left", "right")}
+
+
+def create_app(most: int) -> FastAPI:
+    """The service; `most` is how many candidates of a frame are judged."""
+    app = FastAPI()
+    torch.manual_seed(0)
+    network = AlexNet(normalised=False).eval()
+    lane_probabilities(network, np.zeros((most, INPUT_SIZE, INPUT_SIZE, 3), np.uint8))
+
+    @app.get("/readyz")
+    async def ready() -> dict[str, str]:
+        return {"status": "ready"}
+
+    @app.websocket("/stream")
+    async def stream(socket: WebSocket) -> None:
+        await socket.accept()
+        tracker = NaiveTracker()
+        try:
+            while True:
+                lanes = find_lanes(network, tracker, await socket.receive_bytes(), most)
+                await socket.send_text(json.dumps({"type": "lanes", **lanes}))
+        except WebSocketDisconnect:
+            pass
+
+    return app
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--candidates", type=int, required=True)
+    options = parser.parse_args()
+    uvicorn.run(create_app(options.candidates), port=options.port, log_level="warning")
