@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import click
 
@@ -17,7 +16,7 @@ from bench.plot import plot
 from bench.running import run
 from bench.table import markdown
 from lanestream.errors import LanestreamError
-from lanestream.runtime import Provider
+from lanestream.runtime import PROVIDERS, Provider
 
 
 @click.command()
@@ -26,7 +25,7 @@ from lanestream.runtime import Provider
 @click.option("--soak-minutes", type=click.FloatRange(0.01), help="How long too many frames are pushed  [default: 0.5]")
 @click.option("--clip", help="A video or a folder of images  [default: a rendered drive]")
 @click.option("--frames", type=click.IntRange(1), default=24, show_default=True, help="Frames of it that are sent.")
-@click.option("--provider", type=click.Choice(get_args(Provider)), default="auto", show_default=True)
+@click.option("--provider", type=click.Choice(PROVIDERS), default="auto", show_default=True)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out"), show_default=True)
 def main(
     quick: bool,

@@ -66,7 +66,7 @@ def _times(axes: Axes, told: Mapping[str, Any]) -> None:
         axes.vlines(place, cell["p50_ms"], cell["p95_ms"], color="black", linewidth=1.2)
         axes.annotate(f"{cell['p50_ms']:.0f}", (place, 0.5 * cell["p50_ms"]), ha="center", color="white", weight="bold")
     axes.set_xticks(range(len(rows)), [_LOOKS[name][0].replace(" ", "\n", 1) for name, _ in rows], fontsize=8)
-    axes.set(title="One camera: lower is better", ylabel="ms from frame to reply: median, line up to p95")
+    axes.set(title="One camera: lower is better", ylabel="ms from frame to reply: median, and p95")
     axes.grid(alpha=0.3, axis="y")
 
 
@@ -79,7 +79,7 @@ def _ages(axes: Axes, told: Mapping[str, Any]) -> None:
     axes.set_ylim(bottom=0.0)
     times = soak["pushed_fps"] / max(soak["fps"], 1e-9)
     axes.set(
-        title=f"{soak['clients']} cameras push {times:.1f} times what can be answered",
+        title=f"{soak['clients']} cameras push {times:.1f} x what is answered",
         xlabel="seconds",
         ylabel="frame age at its answer, ms (mode latest)",
     )

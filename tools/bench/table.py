@@ -52,7 +52,7 @@ def markdown(told: Mapping[str, Any]) -> Iterator[str]:
 def _headline(told: Mapping[str, Any], key: str) -> tuple[str, ...]:
     spread = told["ratios"]["1280x720"].get(key)
     between = "" if spread is None else f"{_number(spread['least'], 2)} to {_number(spread['most'], 2)}"
-    return HEADLINES[key], _number(told[key], 2), between
+    return HEADLINES[key], _number(told.get(key), 2), between
 
 
 def _cell(cell: Mapping[str, Any]) -> tuple[str, ...]:
