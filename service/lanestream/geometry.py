@@ -148,16 +148,16 @@ class StripGeometry:
         return widths
 
     def grid(
-        self, curve: Curve, top: float, bottom: float, view: RoadView
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Image (columns, rows) that the pixels of a patch are sampled at, each (size, size)."""
+        self, curve: Curve, top: float, bottom: float, view: RoadView, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Image columns and rows (2, size, size) that a patch's pixels are sampled at, written to `out` if given."""
         rows = self.rows(top, bottom)
+        # Each is a part that is the same all along a row of the patch, and one that grows across it: one product.
+        parts = np.zeros((2, self.size, 2), np.float32)
+        parts[:, :, 0] = curve.x(rows), rows
+        parts[0, :, 1] = self.half_widths(rows, view, float(curve.slope(0.5 * (top + bottom))))
         across = np.linspace(-1.0, 1.0, self.size, dtype=np.float32)
-        slope = float(curve.slope(0.5 * (top + bottom)))
-        half_widths = self.half_widths(rows, view, slope).astype(np.float32)
-        columns = half_widths[:, None] * across
-        columns += curve.x(rows).astype(np.float32)[:, None]
-        return columns, np.repeat(rows.astype(np.float32)[:, None], self.size, axis=1)
+        return np.matmul(parts, np.stack([np.ones_like(across), across]), out=out)
 
 
 @dataclass(frozen=True)

@@ -33,16 +33,12 @@ class StripCutter:
         detail = resized(image, scaling)
         detail_view = view.scaled(scaling, detail.shape[1], detail.shape[0])
         patches = np.empty((len(candidates), size, size, 3), np.uint8)
+        grid, warped = np.empty((2, size, size), np.float32), np.empty((size, size, 3), np.uint8)
         for candidate, patch in zip(candidates, patches, strict=True):
-            columns, rows = self._grid(candidate, detail_view, scaling)
+            curve = scaling.curve_to_working(candidate.curve)
+            top, bottom = scaling.to_working(candidate.top), scaling.to_working(candidate.bottom)
+            columns, rows = self.geometry.grid(curve, top, bottom, detail_view, out=grid)
             # The border is mirrored: black would tell the network where the image ends, which no road does.
-            warped = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+            cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, dst=warped, borderMode=cv2.BORDER_REFLECT_101)
             cv2.cvtColor(warped, cv2.COLOR_BGR2RGB, dst=patch)
         return patches
-
-    def _grid(
-        self, candidate: Candidate, view: RoadView, scaling: Scaling
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        curve = scaling.curve_to_working(candidate.curve)
-        top, bottom = scaling.to_working(candidate.top), scaling.to_working(candidate.bottom)
-        return self.geometry.grid(curve, top, bottom, view)
