@@ -195,7 +195,7 @@ def load_settings(**given: object) -> Settings:
         model_config = SettingsConfigDict(toml_file=path)
 
     try:
-        return Configured(**chosen)
+        return Settings.model_construct(**dict(Configured(**chosen)))
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         name = str(problem["loc"][0])

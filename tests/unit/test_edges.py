@@ -106,7 +106,7 @@ def test_a_missing_package_is_named_with_the_cure() -> None:
 
 def test_the_schemas_name_all_messages() -> None:
     assert {"start", "frame", "end"} == set(schemas()["client"]["discriminator"]["mapping"])
-    assert {"ready", "lanes", "error", "summary"} == set(schemas()["server"]["discriminator"]["mapping"])
+    assert {"ready", "lanes", "error", "draining", "summary"} == set(schemas()["server"]["discriminator"]["mapping"])
 
 
 def test_the_report_counts_and_measures() -> None:
