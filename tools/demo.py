@@ -44,13 +44,20 @@ def main(video: str | None) -> int:
 @contextmanager
 def service(log_path: Path, *arguments: str | Path) -> Iterator[str]:
     """A service on a free port, by its URL, started with further `arguments`; its log goes to `log_path`."""
+    with service_process(log_path, *arguments) as (_, url):
+        yield url
+
+
+@contextmanager
+def service_process(log_path: Path, *arguments: str | Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """The same, with its process."""
     port = free_port()
     url = f"http://127.0.0.1:{port}"
     with log_path.open("w") as log:
         process = subprocess.Popen([LANESTREAM, "serve", "--port", str(port), *arguments], stdout=log, stderr=log)
         try:
             wait_until_ready(process, url, log_path)
-            yield url
+            yield process, url
         finally:
             stop(process)
 

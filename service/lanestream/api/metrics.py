@@ -61,6 +61,7 @@ class Metrics:
         self._resumed = self._counter("lane_sessions_resumed_total", "Attempts to resume a session.", "result")
         self._closes = self._counter("lane_ws_closes_total", "WebSockets that were closed, by close code.", "code")
         self._sessions = self._gauge("lane_sessions_active", "Streams that have a session.")
+        self._tasks = self._gauge("lane_tasks", "Tasks of the event loop.")
         self._queue = self._gauge("lane_queue_depth", "Questions that waited on when the last batch began.")
         self._provider = self._gauge(
             "lane_inference_provider_info", "What runs a network.", "network", "provider", "device", "precision"
@@ -119,6 +120,10 @@ class Metrics:
     def session_closed(self) -> None:
         """One stream less has a session."""
         self._sessions.dec()
+
+    def tasks(self, count: int) -> None:
+        """How many tasks the event loop has just now."""
+        self._tasks.set(count)
 
     def session_resumed(self, result: ResumeResult) -> None:
         """A client came with a resume token."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
@@ -182,9 +183,11 @@ async def readyz(request: Request) -> Readiness:
 
 
 @metrics_router.get("/metrics", response_class=Response, responses={200: {"content": {MEDIA_TYPE: {}}}})
-async def metrics(request: Request) -> Response:
+async def exposition(request: Request) -> Response:
     """Counters and histograms in Prometheus' text format."""
-    return Response(_service(request).metrics.exposition(), headers={"content-type": MEDIA_TYPE})
+    metrics = _service(request).metrics
+    metrics.tasks(len(asyncio.all_tasks()))
+    return Response(metrics.exposition(), headers={"content-type": MEDIA_TYPE})
 
 
 async def _processed(service: Service, opened: OpenSession, image: EncodedFrame) -> ProcessedFrame:
