@@ -115,6 +115,9 @@ class Settings(BaseSettings):
     threads: Annotated[int, Field(ge=1, le=256, description="Threads that decode, propose and track.")] = Field(
         default_factory=processors
     )
+    frames_at_once: Annotated[int, Field(ge=1, le=1024, description="Frames in work at a time; others wait.")] = Field(
+        default_factory=lambda: 2 * processors() + 2
+    )
     opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV takes for one image.")
 
     api_keys: Annotated[tuple[ApiKey, ...], NoDecode, BeforeValidator(_keys)] = Field(

@@ -88,6 +88,20 @@ def test_a_frame_whose_turn_has_come_is_not_replaced() -> None:
     assert next_seq(rules) == 2
 
 
+def test_a_frame_that_waits_for_frames_of_others_is_replaced() -> None:
+    rules = opened("latest")
+    rules.receive(b"a", 101.0)
+    rules.queue(True)
+    rules.receive(b"b", 101.1)
+    rules.receive(b"c", 101.2)
+    rules.queue(False)
+    rules.receive(b"d", 101.3)
+    assert next_seq(rules) == 2
+    rules.settle(Outcome.ANSWERED, 102.0)
+    assert next_seq(rules) == 3
+    assert rules.dropped == 2
+
+
 def test_all_grants_credits_and_an_answer_renews_one() -> None:
     rules = opened("all", most=2)
     rules.receive(b"a", 101.0)

@@ -102,7 +102,7 @@ class Cameras:
             list(workers.map(self._loop, [cameras[thread::threads] for thread in range(min(threads, len(cameras)))]))
 
     async def _run(self) -> None:
-        runner = FrameRunner(self.settings.image_limits, self.settings.threads)
+        runner = FrameRunner(self.settings.image_limits, self.settings.threads, self.settings.frames_at_once)
         cameras = [asyncio.create_task(self._follow(runner, number)) for number in range(self.order.sessions)]
         stopped = asyncio.create_task(asyncio.to_thread(self.stopped.wait))
         done, _ = await asyncio.wait({stopped, *cameras}, return_when=asyncio.FIRST_COMPLETED)
@@ -117,7 +117,8 @@ class Cameras:
         session, seq = self.engine.open_session(detector=self.order.detector), 0
         while True:
             started = time.monotonic()
-            await runner.run(session, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
+            async with runner.turn():
+                await runner.run(session, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
             self._note(number, started)
             seq += 1
 

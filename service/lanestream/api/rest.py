@@ -194,7 +194,9 @@ async def _processed(service: Service, opened: OpenSession, image: EncodedFrame)
     """The lanes of an image, counted whether they are found or not."""
     service.metrics.frame_received()
     try:
-        frame = await service.loaded.runner.run(opened.session, image)
+        runner = service.loaded.runner
+        async with runner.turn():
+            frame = await runner.run(opened.session, image)
     except BaseException as error:
         service.metrics.frame_failed(error)
         raise

@@ -198,9 +198,8 @@ class StreamHandler:
     async def _answer(self) -> None:
         """Answers frames one at a time and in order, until the stream is finished; then says so and closes."""
         while not self._rules.finished:
-            frame = self._rules.take()
-            if frame is not None:
-                await self._send(await self._answer_to(frame))
+            if self._rules.has_waiting:
+                await self._send(await self._next_answer())
                 continue
             self._news.clear()
             await self._news.wait()
@@ -214,6 +213,15 @@ class StreamHandler:
             await self._close(_NORMAL)
         else:
             await self._close(_RESTART, "the service is about to stop")
+
+    async def _next_answer(self) -> Message:
+        """The answer to the next frame. Which one that is shows when its turn has come: until then newer ones count."""
+        self._rules.queue(True)
+        async with self._service.loaded.runner.turn():
+            self._rules.queue(False)
+            frame = self._rules.take()
+            assert frame is not None  # noqa: S101 - of waiting frames one always stays
+            return await self._answer_to(frame)
 
     async def _answer_to(self, frame: IncomingFrame) -> Message:
         opened = self._ensure_session()

@@ -10,6 +10,7 @@ import asyncio
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -54,13 +55,26 @@ class _Begun:
 class FrameRunner:
     """Takes encoded frames to their lanes; the frames of one session one at a time, those of different ones at once.
 
+    `at_once` frames are in work at a time: enough to keep the `threads` and the networks busy. The others wait for
+    their turn before anything is spent on them, so that however many there are, a frame that is begun is soon done.
     `observe` is told of every batch that the networks run.
     """
 
-    def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
+    def __init__(
+        self,
+        limits: ImageLimits,
+        threads: int,
+        at_once: int,
+        observe: Callable[[BatchReport], None] | None = None,
+    ) -> None:
         self._limits = limits
+        self._turns = asyncio.Semaphore(at_once)
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
         self._batcher = Batcher(observe)
+
+    def turn(self) -> AbstractAsyncContextManager[None]:
+        """A place among the frames in work, first come, first served; to be had before `run`."""
+        return self._turns
 
     async def run(self, session: Session, frame: EncodedFrame) -> ProcessedFrame:
         """The lanes of `frame`.

@@ -99,6 +99,7 @@ class StreamRules:
         self._announced: FrameMessage | None = None
         self._waiting: deque[IncomingFrame] = deque()
         self._busy = False
+        self._queued = False
         self._ended = False
         self._draining = False
         self._over = False
@@ -126,6 +127,11 @@ class StreamRules:
     def dropped(self) -> int:
         """Frames that got no lanes because newer ones came, or because they had waited too long."""
         return self._dropped
+
+    @property
+    def has_waiting(self) -> bool:
+        """Whether a frame waits for its turn."""
+        return bool(self._waiting) and not self._busy
 
     @property
     def ended(self) -> bool:
@@ -198,6 +204,10 @@ class StreamRules:
         """The service is about to stop: what has come is answered, what comes from now on is refused."""
         self._draining = True
 
+    def queue(self, waits: bool) -> None:
+        """Tells whether the frame whose turn it is waits for frames of others; a newer one may then replace it."""
+        self._queued = waits
+
     def take(self) -> IncomingFrame | None:
         """The frame whose turn it is; None while another is being worked on, or where none waits."""
         if self._busy or not self._waiting:
@@ -262,7 +272,7 @@ class StreamRules:
 
         One that is `refused` takes no other's place than that of refused ones.
         """
-        turn = 0 if self._busy else 1
+        turn = 0 if self._busy or self._queued else 1
         before = len(self._waiting)
         while len(self._waiting) > turn and (not refused or self._waiting[-1].refusal is not None):
             self._waiting.pop()
