@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: bench evaluate proposals demo serve train-toy test lint picture image image-test up down clean
+.PHONY: bench evaluate proposals demo serve train-toy test lint fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -53,6 +53,14 @@ proposals: $(DEV_READY)
 
 bench: $(DEV_READY)
 	PYTHONPATH=tools $(BIN)/python -m bench $(ARGS)
+
+# Each for so many seconds; atheris builds on CPython 3.11 to 3.13.
+FUZZ_S ?= 600
+
+fuzz: $(DEV_READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[fuzz]'
+	$(BIN)/python tests/fuzz.py decoder -max_total_time=$(FUZZ_S) -print_final_stats=1
+	$(BIN)/python tests/fuzz.py messages -max_total_time=$(FUZZ_S) -print_final_stats=1
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg

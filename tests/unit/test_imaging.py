@@ -11,7 +11,8 @@ import fakes
 import pytest
 
 from lanestream.errors import ImageError, ImageTooLargeError
-from lanestream.imaging import Header, ImageLimits, decode, read_header
+from lanestream.image_files import Header, read_header
+from lanestream.imaging import ImageLimits, decode
 
 LIMITS = ImageLimits()
 KINDS = {".jpg": "JPEG", ".png": "PNG", ".webp": "WebP"}
@@ -34,10 +35,14 @@ def refused(data: bytes, limits: ImageLimits = LIMITS) -> str:
     return str(caught.value)
 
 
+def told(header: Header) -> tuple[str, int, int]:
+    return header.kind, header.width, header.height
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_accepted_kinds_are_decoded(kind: str) -> None:
     data = fakes.image_file(kind)
-    assert read_header(data) == Header(KINDS[kind], 320, 180, complete=True)
+    assert told(read_header(data)) == (KINDS[kind], 320, 180)
     image = decode(data, LIMITS)
     assert image.shape == (180, 320, 3)
     assert abs(int(image[90, 0, 0]) - 30) <= 3
@@ -56,14 +61,14 @@ def test_other_ways_to_write_them_are_understood(options: str) -> None:
         "lossy": (".webp", [cv2.IMWRITE_WEBP_QUALITY, 60]),
     }[options]
     data = cv2.imencode(kind, image, flags)[1].tobytes()
-    assert read_header(data) == Header(KINDS[kind], 130, 100, complete=True)
+    assert told(read_header(data)) == (KINDS[kind], 130, 100)
     assert decode(data, LIMITS).shape == (100, 130, 3)
 
 
 def test_an_extended_webp_tells_its_canvas() -> None:
     canvas = (1280 - 1).to_bytes(3, "little") + (720 - 1).to_bytes(3, "little")
     data = b"RIFF" + (22).to_bytes(4, "little") + b"WEBPVP8X" + (10).to_bytes(4, "little") + bytes(4) + canvas
-    assert read_header(data) == Header("WebP", 1280, 720, complete=True)
+    assert told(read_header(data)) == ("WebP", 1280, 720)
 
 
 @pytest.mark.parametrize("kind", KINDS)

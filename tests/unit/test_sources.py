@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lanestream.errors import ImageError, SourceError
-from lanestream.imaging import read_header
+from lanestream.image_files import read_header
 from lanestream_client.frames import SourceFrame
 from lanestream_client.live import NewestFrames
 from lanestream_client.sinks import video_sink

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Final, Self
 
 from lanestream.errors import ImageError, SourceError
-from lanestream.imaging import MOST_PIXELS, Header, ImageLimits, decode, read_header
+from lanestream.image_files import Header, read_header
+from lanestream.imaging import MOST_PIXELS, ImageLimits, decode
 from lanestream.lanes import Image
 
 import cv2  # isort: skip  (imaging sets OpenCV's own limit before it is imported)
