@@ -60,6 +60,16 @@ def test_a_known_horizon_is_kept_but_for_a_nod() -> None:
         assert CandidateSearch().propose(still.image, horizon).view.horizon == pytest.approx(horizon, abs=20.0)
 
 
+def test_followed_boundaries_come_first_and_fewer_others_with_them() -> None:
+    still = fair_scene(640, 360)
+    found = CandidateSearch().propose(still.image).candidates
+    expected = [found[-1].curve]
+    followed = CandidateSearch().propose(still.image, still.horizon, expected).candidates
+    assert len(found) == 16
+    assert len(followed) == 12
+    assert followed[0].curve == expected[0]
+
+
 @pytest.mark.parametrize("share", [0.0001, 0.1, 0.9, 0.99, 0.9999])
 @pytest.mark.parametrize(("width", "height"), [(64, 64), (320, 64), (64, 320), (640, 360)])
 def test_a_senseless_horizon_does_no_harm(share: float, width: int, height: int) -> None:

@@ -47,10 +47,11 @@ class CandidateSearch:
 
     Lines come from `sources`: pairs of Hough edges that bound a marking, single ones, and rays of the fan.
     `perspective` looks for the road's perspective around a guess, `near_prior` around what a prior says of it. `limit`
-    is the most candidates of a frame. Two edges are one marking where their distance is `least_width` to `most_width`
-    times the rows below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for double lines).
-    Candidates nearer than `separation` times the rows below the horizon, at two rows, are the same. Where there is a
-    prior but no known horizon, lines found without the prior count `unguided` times their strength.
+    is the most candidates of a frame, `followed` of one in which boundaries are expected: those come first, so that
+    fewer are needed. Two edges are one marking where their distance is `least_width` to `most_width` times the rows
+    below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for double lines). Candidates nearer
+    than `separation` times the rows below the horizon, at two rows, are the same. Where there is a prior but no known
+    horizon, lines found without the prior count `unguided` times their strength.
     """
 
     hough: ExtendedHough = ExtendedHough()
@@ -62,6 +63,7 @@ class CandidateSearch:
     )
     fan: Fan = Fan()
     limit: int = 16
+    followed: int = 12
     least_width: float = 0.03
     most_width: float = 0.4
     separation: float = 0.05
@@ -102,7 +104,8 @@ class CandidateSearch:
         kept = ranked.taken(ranked.apart(self.separation, view))
         image_view = RoadView(width, height, scaling.to_image(point.y))
         candidates = _candidates(kept, _curves(kept, scaling, view, point), image_view)
-        return Proposals(tuple(candidates[: self.limit]), image_view, point.weight)
+        limit = min(self.limit, self.followed) if expected else self.limit
+        return Proposals(tuple(candidates[:limit]), image_view, point.weight)
 
     def _seen_road(self, grey: Image, prior: RoadPrior, scaling: Scaling) -> tuple[Perspective, HoughLines]:
         """The perspective of a prior, moved to where ridges gather, and the Hough lines below its horizon."""
