@@ -6,6 +6,7 @@ A record that concerns a session or a frame says so by `extra={"session": ..., "
 from __future__ import annotations
 
 import logging
+from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
 from pythonjsonlogger.core import RESERVED_ATTRS
@@ -19,6 +20,10 @@ _TIME: Final = "time"
 _CONTEXT: Final = ("session", "seq")
 # What libraries add to their records, for their own formatters.
 _OF_LIBRARIES: Final = ("color_message", "websocket")
+# uvicorn's records of requests: address, method, path, version and status.
+_ACCESS: Final = "uvicorn.access"
+_ACCESS_ARGUMENTS: Final = 5
+_PROBES: Final = frozenset({"/healthz", "/readyz", "/metrics"})
 
 
 class TextFormatter(logging.Formatter):
@@ -69,6 +74,17 @@ class WithoutFalseAlarms(logging.Filter):
         return record.msg != "ASGI callable returned without completing handshake."
 
 
+class WithoutProbes(logging.Filter):
+    """Drops the lines about probes that went well: they come every few seconds and tell nothing."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is kept."""
+        if record.name != _ACCESS or not isinstance(record.args, tuple) or len(record.args) != _ACCESS_ARGUMENTS:
+            return True
+        path, status = record.args[2], record.args[4]
+        return path not in _PROBES or status != HTTPStatus.OK
+
+
 def log_config(settings: Settings) -> dict[str, Any]:
     """The configuration, for `logging.config.dictConfig`, that `settings` ask for."""
     level = settings.log_level
@@ -78,9 +94,17 @@ def log_config(settings: Settings) -> dict[str, Any]:
         "version": 1,
         "disable_existing_loggers": False,
         "formatters": {"lines": {"()": TextFormatter if settings.log_format == "text" else JsonLines}},
-        "filters": {"queries": {"()": WithoutQueries}, "alarms": {"()": WithoutFalseAlarms}},
+        "filters": {
+            "queries": {"()": WithoutQueries},
+            "alarms": {"()": WithoutFalseAlarms},
+            "probes": {"()": WithoutProbes},
+        },
         "handlers": {
-            "stderr": {"class": "logging.StreamHandler", "formatter": "lines", "filters": ["queries", "alarms"]},
+            "stderr": {
+                "class": "logging.StreamHandler",
+                "formatter": "lines",
+                "filters": ["queries", "alarms", "probes"],
+            },
         },
         "root": {"handlers": ["stderr"], "level": "WARNING"},
         "loggers": {

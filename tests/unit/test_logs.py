@@ -9,7 +9,7 @@ from datetime import datetime
 
 import pytest
 
-from lanestream.logs import JsonLines, TextFormatter, WithoutFalseAlarms, WithoutQueries, log_config
+from lanestream.logs import JsonLines, TextFormatter, WithoutFalseAlarms, WithoutProbes, WithoutQueries, log_config
 from lanestream.settings import Settings
 
 
@@ -70,6 +70,16 @@ def test_queries_are_cut_off() -> None:
 def test_only_the_false_alarm_is_dropped() -> None:
     assert not WithoutFalseAlarms().filter(record("ASGI callable returned without completing handshake."))
     assert WithoutFalseAlarms().filter(record("ASGI callable should return None, but returned '%s'.", 1))
+
+
+def test_only_probes_that_went_well_are_not_told() -> None:
+    def kept(path: str, status: int) -> bool:
+        found = record('%s - "%s %s HTTP/%s" %d', "127.0.0.1:1", "GET", path, "1.1", status)
+        found.name = "uvicorn.access"
+        return WithoutProbes().filter(found)
+
+    assert [kept(*each) for each in (("/readyz", 200), ("/readyz", 503), ("/v1/models", 200))] == [False, True, True]
+    assert WithoutProbes().filter(record("ready"))
 
 
 @pytest.mark.parametrize(
