@@ -101,16 +101,16 @@ class AsyncLaneClient:
 
     async def _answer(self, ask: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
         """The good answer of the first replica that gives one. Raises the last one's error where none does."""
-        for left in reversed(range(len(self._replicas))):
-            replica = self._replicas[0]
-            try:
-                with requests.reaching(replica.base):
-                    return requests.checked(await ask(replica.http))
-            except PASSING:
-                self._replicas.rotate(-1)
-                if not left:
-                    raise
-        raise AssertionError("a client has a replica")
+        for _ in range(len(self._replicas) - 1):
+            with suppress(*PASSING):
+                return await self._answer_of_first(ask)
+            self._replicas.rotate(-1)
+        return await self._answer_of_first(ask)
+
+    async def _answer_of_first(self, ask: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
+        replica = self._replicas[0]
+        with requests.reaching(replica.base):
+            return requests.checked(await ask(replica.http))
 
 
 class AsyncLaneStream:

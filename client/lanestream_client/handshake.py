@@ -55,6 +55,8 @@ def options(endpoint: Endpoint, timeout: float) -> dict[str, Any]:
         "ping_interval": _PING_S,
         "ping_timeout": _PONG_S,
         "close_timeout": _CLOSE_S,
+        # No more comes than was asked for, and a full queue would hold up pongs: a caller that dawdles is no loss.
+        "max_queue": None,
         "logger": _discreet_logger(),
     }
 

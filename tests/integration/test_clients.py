@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -31,6 +32,7 @@ from lanestream_client.in_process import InProcess
 from lanestream_client.service import ServiceInfo
 
 Serve = Callable[..., str]
+PAGE = Path(__file__).parents[2] / "docs" / "client.md"
 
 
 def frames(count: int) -> Iterator[SourceFrame]:
@@ -293,3 +295,16 @@ def test_a_message_that_was_too_big_is_told_as_that() -> None:
         pytest.raises(ImageTooLargeError),
     ):
         list(client.stream(frames(100), mode="all"))
+
+
+def test_the_code_of_the_page_about_the_client(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "road.jpg").write_bytes(fakes.image_file())
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert len(blocks) == 2
+    for code in blocks:
+        exec(code.replace("http://127.0.0.1:8000", url), {})  # noqa: S102
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split(" ", 2)[0] for line in lines if line[0].isdigit()] == [str(seq) for seq in range(25)]

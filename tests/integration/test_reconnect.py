@@ -238,7 +238,8 @@ def test_patience_ends(stream: Stream) -> None:
 
     with scripted(breaking, then=NotReadyError("starting")) as script:
         results, followed, error = stream(script.url, [b"image"], reconnect_s=0.2)
-    assert isinstance(error, NotReadyError)
+    # The last attempt may be cut short by the end of the patience.
+    assert isinstance(error, NotReadyError | ConnectionFailedError)
     assert results == [(0, "lost")]
     assert followed.summary.lost == 1
 
