@@ -60,7 +60,9 @@ def _headers(api_key: str | None) -> dict[str, str]:
     if api_key is None:
         return {}
     if not _KEY.fullmatch(api_key):
-        raise SettingsError("the API key is none", "a key is one word of ASCII characters; look for a stray space")
+        raise SettingsError(
+            "the API key can't be sent", "a key is one word of ASCII characters; look for a stray space"
+        )
     return {"Authorization": f"Bearer {api_key}"}
 
 

@@ -115,6 +115,9 @@ def start(
         "camera": None if camera is None else camera.model_dump(),
         "session": session,
     }
-    message = parse_client_message(json.dumps(asked))
+    try:
+        message = parse_client_message(json.dumps(asked))
+    except ProtocolError as error:
+        raise ProtocolError(error.message) from None  # its hint is about messages, which a caller here does not write
     assert isinstance(message, StartMessage)  # noqa: S101 - its type says so
     return message
