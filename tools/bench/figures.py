@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Iterable, Sequence
-from importlib.metadata import version
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -19,7 +20,7 @@ from bench.running import Overload, Results, compared
 
 _PACKAGES: Final = (
     *("lanestream", "onnxruntime", "opencv-python-headless", "numpy", "uvicorn", "websockets", "fastapi"),
-    *("torch", "litserve", "filterpy"),
+    *("torch", "litserve", "filterpy", "openvino"),
 )
 Round = dict[Cell, Sample]
 
@@ -47,8 +48,15 @@ def figures(results: Results, plan: Plan, hello: Hello, frames: str) -> dict[str
         "candidates_per_frame": round(hello.patches, 2),
         "frames": frames,
         "machine": machine(),
-        "versions": {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}},
+        "versions": {"python": platform.python_version(), **dict(_versions())},
     }
+
+
+def _versions() -> Iterator[tuple[str, str]]:
+    """The packages that are there; a runtime may be missing."""
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            yield package, version(package)
 
 
 def machine() -> dict[str, Any]:

@@ -41,7 +41,7 @@ def markdown(told: Mapping[str, Any]) -> Iterator[str]:
     yield (
         f"{machine['processors']} processors ({machine['processor']}), provider {told['provider']}, {told['model']},"
         f" {told['candidates_per_frame']:g} candidates a frame, {told['frames']}, {told['rounds']} rounds,"
-        f" onnxruntime {versions['onnxruntime']}, PyTorch {versions['torch']}, LitServe {versions['litserve']}."
+        f" PyTorch {versions['torch']}, LitServe {versions['litserve']}."
     )
     yield ""
     yield from _rows(("1280 x 720", "median", "least to most"), (_headline(told, key) for key in HEADLINES))
