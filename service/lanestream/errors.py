@@ -113,7 +113,7 @@ class EvictedError(LanestreamError):
 
 
 class IdleError(LanestreamError):
-    """Nothing came over a stream for too long."""
+    """Nothing came over a stream for too long, or not all of a request."""
 
     code = "idle"
 

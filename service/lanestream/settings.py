@@ -104,6 +104,7 @@ class Settings(BaseSettings):
     handshake_s: float = Field(
         default=10.0, gt=0.0, description="The first message of a stream comes within this time."
     )
+    body_s: float = Field(default=30.0, gt=0.0, description="A single image has to come within this time.")
     idle_s: float = Field(default=60.0, gt=0.0, description="A stream from which nothing comes for so long is closed.")
     session_s: float = Field(default=86_400.0, gt=0.0, description="A session's longest life, over all its sockets.")
     resume_s: float = Field(default=60.0, ge=1.0, description="A session can be resumed so long after its last socket.")

@@ -93,6 +93,7 @@ async def _tell_invalid(request: Request, error: Exception) -> JSONResponse:
 async def _tell_http(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)  # noqa: S101  (this is the class it is registered for)
     code = HTTPStatus(error.status_code).name.lower()
+    request.app.state.service.metrics.refused(code)
     # The path as it came: what `request.url` reads can be bent by the Host header.
     message = f"{request.method} {request.scope['path']}: {error.detail}"
     answer = problem_response(error.status_code, Problem(code=code, message=message, hint="see /docs"))

@@ -32,8 +32,8 @@ def problem_of(error: BaseException) -> JSONResponse:
 def problem_response(status: int, problem: Problem) -> JSONResponse:
     """The answer with this status and body, and the headers that belong to the status."""
     headers = {}
-    if status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:
-        # What is left of a body that is too large will not be read.
+    if status in (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.REQUEST_TIMEOUT):
+        # What is left of a body that is too large or too slow will not be read.
         headers["connection"] = "close"
     if status == HTTPStatus.UNAUTHORIZED:
         headers["www-authenticate"] = "Bearer"

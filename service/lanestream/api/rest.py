@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel
-from starlette.datastructures import UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
-from starlette.requests import ClientDisconnect
 
 from lanestream.api.accept import preferred
 from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
 from lanestream.api.service import Service
-from lanestream.errors import ImageTooLargeError, NotAcceptableError, ProtocolError
+from lanestream.errors import NotAcceptableError
 from lanestream.messages import lanes_message
 from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
 from lanestream.sessions.caller import Caller
@@ -27,7 +23,6 @@ from lanestream.sessions.runner import EncodedFrame
 if TYPE_CHECKING:
     from lanestream.api.service import Draw
     from lanestream.detection import Pipeline
-    from lanestream.imaging import ImageLimits
     from lanestream.messages import ProcessedFrame
     from lanestream.sessions.manager import OpenSession
 
@@ -40,8 +35,6 @@ metrics_router = APIRouter()
 
 _JSON: Final = "application/json"
 _PICTURES: Final = {"image/jpeg": ".jpg", "image/png": ".png"}
-# What boundaries and part headers may add to the bytes of a multipart body's one file.
-_MULTIPART_EXTRA: Final = 1 << 16
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["schema"]}, "required": ["file"]}}
 
@@ -87,6 +80,7 @@ class Readiness(BaseModel):
 
 _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     406: {"model": Problem, "description": "No answer in the form that was asked for"},
+    408: {"model": Problem, "description": "A body that took too long to come"},
     413: {"model": Problem, "description": "More bytes or pixels than are accepted"},
     415: {"model": Problem, "description": "Not an image, or a corrupt one"},
     422: {"model": Problem, "description": "A malformed request, or a detector that is not loaded"},
@@ -145,8 +139,11 @@ async def detect(
     service.check_open()
     loaded = service.loaded
     form = _answer_form(request, service.draw)
+    # What is refused anyway is refused before its body is read; what is read slowly holds no session meanwhile.
+    loaded.engine.pipeline(detector)
+    service.sessions.check_limits(caller)
+    data = await service.bodies.image_file(request)
     with service.sessions.opened(loaded.engine, caller, horizon, detector) as opened:
-        data = await _image_bytes(request, service.settings.image_limits)
         frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic()))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
     if form == _JSON or service.draw is None:
@@ -220,46 +217,3 @@ def _answer_form(request: Request, draw: Draw | None) -> str:
 def _picture(draw: Draw, frame: ProcessedFrame, message: LanesMessage, form: str) -> bytes:
     _, encoded = cv2.imencode(_PICTURES[form], draw(frame.image, message))
     return encoded.tobytes()
-
-
-async def _image_bytes(request: Request, limits: ImageLimits) -> bytes:
-    """The image file in the body; no more of the body is ever read than the limit allows."""
-    if request.headers.get("content-type", "").startswith("multipart/form-data"):
-        return await _form_file(request, limits)
-    return b"".join([chunk async for chunk in _limited(request, limits.max_bytes)])
-
-
-async def _form_file(request: Request, limits: ImageLimits) -> bytes:
-    body = _limited(request, limits.max_bytes + _MULTIPART_EXTRA)
-    parser = MultiPartParser(request.headers, body, max_files=1, max_fields=8)
-    parser.spool_max_size = limits.max_bytes + 1
-    try:
-        form = await parser.parse()
-    except MultiPartException as error:
-        raise ProtocolError(f"the form can't be read: {error.message}", "send the image as the field `file`") from None
-    try:
-        file = form.get("file")
-        if not isinstance(file, UploadFile):
-            raise ProtocolError("the form has no file named `file`", "curl -F file=@road.jpg")
-        return await file.read()
-    finally:
-        await form.close()
-
-
-async def _limited(request: Request, most: int) -> AsyncGenerator[bytes]:
-    declared = request.headers.get("content-length", "")
-    size = int(declared) if declared.isdecimal() else 0
-    if size <= most:
-        size = 0
-        try:
-            async for chunk in request.stream():
-                size += len(chunk)
-                if size > most:
-                    break
-                yield chunk
-        except ClientDisconnect:
-            raise ProtocolError("the client went away before the end of its request") from None
-    if size > most:
-        raise ImageTooLargeError(
-            f"the request has more than the {most:,} bytes that are accepted", "send a smaller JPEG"
-        )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lanestream.api.access import Gatekeeper
+from lanestream.api.bodies import BodyReader
 from lanestream.api.metrics import Metrics
 from lanestream.errors import DrainingError, NotReadyError
 from lanestream.protocol import Limits
@@ -47,6 +48,7 @@ class Service:
         self.draw = draw
         self.gatekeeper = Gatekeeper.of(settings)
         self.metrics = Metrics()
+        self.bodies = BodyReader(settings.max_bytes, settings.max_sessions, settings.body_s)
         self.streams: set[StreamHandler] = set()
         self.draining = False
         self._store = _store(settings)

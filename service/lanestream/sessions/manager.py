@@ -103,6 +103,18 @@ class SessionManager:
         """How long ago a session began, on whichever replica."""
         return self._wall() - opened.born
 
+    def check_limits(self, caller: Caller) -> None:
+        """Raises BusyError where no session more can be opened, in all or by `caller`."""
+        limits = self._limits
+        if len(self._open) >= limits.sessions:
+            raise BusyError(f"all {limits.sessions} sessions are taken", "try again later")
+        if limits.sessions_per_caller is None:
+            return
+        if sum(opened.caller.quota == caller.quota for opened in self._open) >= limits.sessions_per_caller:
+            raise BusyError(
+                f"you have {limits.sessions_per_caller} sessions, which is the most for one caller", "end one of them"
+            )
+
     def open(
         self,
         engine: Engine,
@@ -115,7 +127,7 @@ class SessionManager:
 
         Raises BusyError at a limit, NoDetectorError where `detector` is not loaded.
         """
-        self._check_limits(caller)
+        self.check_limits(caller)
         session = engine.open_session(horizon, detector)
         opened = OpenSession(name or secrets.token_hex(8), session, caller, self._wall())
         self._open.add(opened)
@@ -181,17 +193,6 @@ class SessionManager:
             if opened.key is not None and self._by_key.get(opened.key) is opened:
                 del self._by_key[opened.key]
             opened.gone.set()
-
-    def _check_limits(self, caller: Caller) -> None:
-        limits = self._limits
-        if len(self._open) >= limits.sessions:
-            raise BusyError(f"all {limits.sessions} sessions are taken", "try again later")
-        if limits.sessions_per_caller is None:
-            return
-        if sum(opened.caller.quota == caller.quota for opened in self._open) >= limits.sessions_per_caller:
-            raise BusyError(
-                f"you have {limits.sessions_per_caller} sessions, which is the most for one caller", "end one of them"
-            )
 
     async def _taken(self, token: str, caller: Caller, owner: str) -> SessionRecord | None:
         """The record of the session of `token`, owned by `owner` from now on; a socket that still has it has to go."""

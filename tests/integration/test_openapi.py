@@ -1,0 +1,86 @@
+"""The REST API keeps what its OpenAPI document promises, whatever comes in: requests made up from that document."""
+
+from __future__ import annotations
+
+import fakes
+import pytest
+import schemathesis
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from schemathesis import GenerationMode
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi import checks
+
+from lanestream.api import create_app
+from lanestream.settings import Settings
+from lanestream_client.overlays import draw_lanes
+
+CHECKS = [
+    not_a_server_error,
+    checks.status_code_conformance,
+    checks.content_type_conformance,
+    checks.response_schema_conformance,
+    checks.response_headers_conformance,
+]
+DOCUMENT = schemathesis.openapi.from_dict(create_app(None, Settings(), draw_lanes).openapi())
+OPERATIONS = {result.ok().label: result.ok() for result in DOCUMENT.get_all_operations()}
+DETECT = "POST /v1/detect"
+MADE_UP = [(label, GenerationMode.POSITIVE) for label in OPERATIONS] + [(DETECT, GenerationMode.NEGATIVE)]
+BODIES = [
+    *(fakes.image_file(kind) for kind in (".jpg", ".png", ".webp")),
+    fakes.image_file()[:900],
+    fakes.image_file(".png", 8000, 1200, 0),
+    b"no image",
+]
+ACCEPTED = [
+    "application/json",
+    "image/png",
+    "image/*;q=0.5, text/html",
+    "*/*",
+    "text/html",
+    "",
+    "image/jpeg;q=nan",
+    ";,=",
+]
+
+exhaustive = settings(max_examples=60, derandomize=True, deadline=None, database=None)
+
+
+def test_the_document_tells_of_every_request() -> None:
+    assert OPERATIONS.keys() >= {
+        DETECT,
+        "GET /v1/models",
+        "GET /v1/schema",
+        "GET /healthz",
+        "GET /readyz",
+        "GET /metrics",
+    }
+
+
+@pytest.mark.parametrize(("label", "mode"), MADE_UP)
+@given(data=st.data())
+@exhaustive
+def test_every_answer_is_one_that_is_promised(
+    both_url: str, label: str, mode: GenerationMode, data: st.DataObject
+) -> None:
+    case = data.draw(OPERATIONS[label].as_strategy(generation_mode=mode))
+    case.call_and_validate(
+        base_url=both_url, checks=[*CHECKS, checks.negative_data_rejection, checks.unsupported_method]
+    )
+
+
+def test_so_is_every_answer_to_an_image(both_url: str) -> None:
+    statuses: set[int] = set()
+
+    @given(data=st.data(), body=st.sampled_from(BODIES), accept=st.sampled_from(ACCEPTED))
+    @exhaustive
+    def detect(data: st.DataObject, body: bytes, accept: str) -> None:
+        case = data.draw(OPERATIONS[DETECT].as_strategy(generation_mode=GenerationMode.POSITIVE))
+        case.media_type, case.body = "image/jpeg", body
+        case.headers["accept"] = accept
+        answer = case.call(base_url=both_url)
+        statuses.add(answer.status_code)
+        case.validate_response(answer, checks=CHECKS)
+
+    detect()
+    assert statuses >= {200, 406, 413, 415, 422}
