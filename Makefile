@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: bench evaluate proposals demo serve train-toy test lint fuzz picture image image-test up down clean
+.PHONY: bench soak evaluate proposals demo serve train-toy test lint fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -56,6 +56,11 @@ bench: $(DEV_READY)
 
 # Each for so many seconds; atheris builds on CPython 3.11 to 3.13.
 FUZZ_S ?= 600
+
+SOAK_MINUTES := 30
+
+soak: $(DEV_READY)
+	$(BIN)/python tools/soak.py --minutes $(SOAK_MINUTES)
 
 fuzz: $(DEV_READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[fuzz]'

@@ -106,7 +106,8 @@ def findings(seen: list[Vitals], before: Vitals) -> dict[str, float | int]:
         "memory_mb_after_warm_up": round(start, 1),
         "memory_mb_at_the_end": round(end, 1),
         "memory_growth_percent": round(100.0 * (end - start) / start, 2),
-        "threads_left": seen[-1].threads - before.threads,
+        # Pools grow to their size in the warm-up; from then on nothing may be added.
+        "threads_left": seen[-1].threads - max(each.threads for each in seen if each not in after),
         "tasks_left": seen[-1].tasks - before.tasks,
         "sessions_left": seen[-1].sessions,
     }
