@@ -59,7 +59,7 @@ class CandidateSearch:
     perspective: PerspectiveSearch = PerspectiveSearch()
     sources: tuple[Source, ...] = ("pairs", "singles", "rays")
     near_prior: PerspectiveSearch = PerspectiveSearch(
-        spread_x=0.03, nod=0.01, spread_bend=0.015, rounds=((5, 0.8), (5, 0.3), (5, 0.1))
+        spread_x=0.03, nod=0.01, spread_bend=0.015, ridges=600, rounds=((5, 0.8), (5, 0.3), (5, 0.1))
     )
     fan: Fan = Fan()
     limit: int = 16
@@ -111,7 +111,8 @@ class CandidateSearch:
         """The perspective of a prior, moved to where ridges gather, and the Hough lines below its horizon."""
         height, width = grey.shape
         guess = _perspective(prior, scaling, height)
-        point = self.near_prior.refine(guess, find_ridges(grey, guess.y), width, height - 1.0, known=True)
+        ridges = find_ridges(grey, guess.y, self.near_prior.ridges)
+        point = self.near_prior.refine(guess, ridges, width, height - 1.0, known=True)
         return point, self._edges_and_lines(grey, point.y)
 
     def _road(self, grey: Image, horizon: float | None) -> tuple[Perspective, HoughLines]:
@@ -123,7 +124,7 @@ class CandidateSearch:
         lines = self._edges_and_lines(grey, top)
         first = self.vanishing.find(lines, width, height, horizon)
         guess = Perspective(first.x, first.y, 0.0, first.weight)
-        ridges = find_ridges(grey, guess.y)
+        ridges = find_ridges(grey, guess.y, self.perspective.ridges)
         point = self.perspective.refine(guess, ridges, width, height - 1.0, horizon is not None)
         return replace(point, y=min(point.y, lowest)), lines
 

@@ -50,8 +50,8 @@ class RidgePoints:
     weight: NDArray[np.float64]
 
 
-def find_ridges(grey: Image, horizon: float, width: float = 0.1, limit: int = 600) -> RidgePoints:
-    """The strongest local maxima of a bar filter that is `width` times the depth of each row wide, in a grey image."""
+def find_ridges(grey: Image, horizon: float, limit: int, width: float = 0.1) -> RidgePoints:
+    """The `limit` strongest local maxima of a bar filter, `width` times the depth of each row wide, in a grey image."""
     bottom = grey.shape[0] - 1
     rows = np.unique(np.linspace(horizon + 0.08 * (bottom - horizon), bottom, 112).astype(int))
     ridge = _bars(grey, rows, np.maximum(np.rint(0.5 * width * (rows - horizon)), 1).astype(int))
@@ -88,7 +88,7 @@ class PerspectiveSearch:
     the strongest bend; of a horizon that is known, the row is only `nod` away, as a camera nods on its wheels. Ridges
     gather in cells of `cell` image widths on the bottom row; `prior` is the share of the best score that a hypothesis
     at the end of its spread must make up for. Each of `rounds` tries so many values of all three, within so much of
-    the spread about the best ones so far.
+    the spread about the best ones so far, on `ridges` ridges.
     """
 
     spread_x: float = 0.12
@@ -98,6 +98,7 @@ class PerspectiveSearch:
     cell: float = 0.012
     reach: float = 3.0
     prior: float = 0.15
+    ridges: int = 1000
     rounds: tuple[tuple[int, float], ...] = ((7, 1.0), (5, 0.3), (5, 0.1))
 
     def refine(self, guess: Perspective, ridges: RidgePoints, width: int, bottom: float, known: bool) -> Perspective:
