@@ -13,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from lanestream.errors import LanestreamError, ProtocolError
 
 SUBPROTOCOL: Final = "lanestream.v1"
+# Beyond it a number of JSON is not the same one for everybody who reads it (RFC 8259, section 6).
+MOST_SEQ: Final = 2**53 - 1
 
 Point = tuple[float, float]
 Mode = Literal["latest", "all"]
@@ -63,7 +65,7 @@ class FrameMessage(Message):
     """Client: numbers the binary message that follows. What is absent is assigned by the service."""
 
     type: Literal["frame"] = "frame"
-    seq: Annotated[int, Field(ge=0)] | None = None
+    seq: Annotated[int, Field(ge=0, le=MOST_SEQ)] | None = None
     timestamp: Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)] | None = Field(
         default=None, description="Capture time in seconds; any clock that does not go backwards."
     )

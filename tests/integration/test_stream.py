@@ -135,6 +135,7 @@ BAD_TEXTS = [
     '{"type": "start", "detector": "guesses"}',
     '{"type": "start", "speed": 1}',
     '{"type": "frame", "seq": -1}',
+    '{"type": "frame", "seq": 9007199254740992}',
     '{"type": "frame", "timestamp": 1e400}',
     '{"type": "frame", "timestamp": 1e300}',
     '{"type": "frame", "timestamp": NaN}',
