@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: bench soak evaluate proposals demo serve train-toy test lint fuzz picture image image-test up down clean
+.PHONY: bench soak evaluate proposals demo serve train-toy test lint asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -53,6 +53,14 @@ proposals: $(DEV_READY)
 
 bench: $(DEV_READY)
 	PYTHONPATH=tools $(BIN)/python -m bench $(ARGS)
+
+asyncapi: $(DEV_READY)
+	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml
+
+# Needs npm: the schema of AsyncAPI documents is published there alone.
+asyncapi-check: $(DEV_READY)
+	npm install --silent --no-audit --no-fund --prefix out/asyncapi @asyncapi/specs@6
+	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml out/asyncapi/node_modules/@asyncapi/specs/schemas/3.0.0.json
 
 # Each for so many seconds; atheris builds on CPython 3.11 to 3.13.
 FUZZ_S ?= 600

@@ -224,6 +224,13 @@ def answer_to(error: BaseException) -> Answer:
     return _ANSWERS.get(error.code, _INTERNAL) if isinstance(error, LanestreamError) else _INTERNAL
 
 
+def told_errors() -> dict[str, tuple[str, Answer]]:
+    """What each error that a service tells means, and how it is answered, by its code."""
+    meanings = {kind.code: " ".join((kind.__doc__ or "").split()) for kind in _kinds(LanestreamError)}
+    own = {LanestreamError.code: ("A mistake of the service's own; its log tells more.", _INTERNAL)}
+    return {code: (meanings[code], answer) for code, answer in _ANSWERS.items()} | own
+
+
 def error_of(code: str, message: str, hint: str = "") -> LanestreamError:
     """The error that the service told as `code`, of the class that has this code; of the root where none has."""
     for kind in _kinds(LanestreamError):

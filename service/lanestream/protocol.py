@@ -13,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from lanestream.errors import LanestreamError, ProtocolError
 
 SUBPROTOCOL: Final = "lanestream.v1"
+# What comes after it in the name of another subprotocol is an API key: browsers can't set headers on a WebSocket.
+KEY_SUBPROTOCOL: Final = "bearer."
 # Beyond it a number of JSON is not the same one for everybody who reads it (RFC 8259, section 6).
 MOST_SEQ: Final = 2**53 - 1
 

@@ -31,7 +31,7 @@ TOKEN, KEY = new_key("camera-7")
 OTHER_TOKEN, OTHER_KEY = new_key("camera-8")
 FOREIGN = "https://evil.example"
 LISTED = "https://lanes.example.com"
-OPEN_PATHS = {"/healthz", "/readyz", "/v1/schema"}
+OPEN_PATHS = {"/healthz", "/readyz", "/v1/schema", "/v1/asyncapi.json"}
 
 
 @pytest.fixture

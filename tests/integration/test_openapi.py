@@ -51,6 +51,7 @@ def test_the_document_tells_of_every_request() -> None:
         DETECT,
         "GET /v1/models",
         "GET /v1/schema",
+        "GET /v1/asyncapi.json",
         "GET /healthz",
         "GET /readyz",
         "GET /metrics",

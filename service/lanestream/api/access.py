@@ -16,6 +16,7 @@ from starlette.requests import HTTPConnection
 
 from lanestream.errors import ForbiddenError, UnauthorizedError
 from lanestream.keys import ApiKey, find, read_keys
+from lanestream.protocol import KEY_SUBPROTOCOL
 from lanestream.sessions.caller import ANONYMOUS, Caller
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _SCHEME: Final = "bearer"
-# Browsers can't set headers on a WebSocket, but they can offer subprotocols.
-_KEY_SUBPROTOCOL: Final = "bearer."
 _HOW: Final = "send the header `Authorization: Bearer KEY`, or from a browser offer the subprotocol `bearer.KEY`"
 _PORTS: Final = {"http": 80, "https": 443}
 
@@ -97,8 +96,8 @@ def _token(connection: HTTPConnection) -> str | None:
         scheme, _, token = header.strip().partition(" ")
         return token.strip() if scheme.lower() == _SCHEME else None
     for offered in connection.scope.get("subprotocols", ()):
-        if offered.startswith(_KEY_SUBPROTOCOL):
-            return str(offered).removeprefix(_KEY_SUBPROTOCOL)
+        if offered.startswith(KEY_SUBPROTOCOL):
+            return str(offered).removeprefix(KEY_SUBPROTOCOL)
     return None
 
 

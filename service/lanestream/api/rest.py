@@ -14,6 +14,7 @@ from lanestream.api.accept import preferred
 from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
 from lanestream.api.service import Service
+from lanestream.asyncapi import document
 from lanestream.errors import NotAcceptableError
 from lanestream.messages import lanes_message
 from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
@@ -163,6 +164,12 @@ async def models(request: Request) -> ModelList:
 async def schema() -> dict[str, dict[str, Any]]:
     """JSON Schemas of the messages of `/v1/stream`: what a client sends, and what the service sends."""
     return schemas()
+
+
+@open_router.get("/v1/asyncapi.json")
+async def asyncapi() -> dict[str, Any]:
+    """The contract of `/v1/stream` as an AsyncAPI 3.0 document, with the same schemas."""
+    return document()
 
 
 @open_router.get("/healthz")
