@@ -8,7 +8,7 @@ told by generators, `Steps`: they yield questions and are sent the answers, and 
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
@@ -29,7 +29,8 @@ class Prepared:
     """A frame on its way through a detector: network inputs (N, H, W, 3) uint8, and what `finish` needs again.
 
     `view` is the road view that the inputs were made in, and `horizon_weight` (0 to 1) tells how much of its horizon
-    was found in this frame. `looks` are the views of the inputs one by one, where each has its own.
+    was found in this frame. `looks` are the views of the inputs one by one, where each has its own. `glanced` is the
+    row of the horizon that a glance at the frame saw; None without one.
     """
 
     image: Image
@@ -38,6 +39,7 @@ class Prepared:
     candidates: tuple[Candidate, ...] = ()
     horizon_weight: float = 0.0
     looks: tuple[RoadView, ...] = ()
+    glanced: float | None = None
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,19 @@ class Pipeline:
     network: Network
     glance: RoadGlance | None = None
 
-    def prepare(self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = ()) -> Steps[Prepared]:
-        """The detector's first half, after the glance; arguments as for `LaneDetector.prepare`."""
-        prior = None if self.glance is None else (yield from self.glance.look(image, horizon))
-        return self.detector.prepare(image, horizon, expected, prior)
+    def prepare(
+        self,
+        image: Image,
+        horizon: float | None = None,
+        expected: Sequence[Curve] = (),
+        glanced: float | None = None,
+    ) -> Steps[Prepared]:
+        """The detector's first half, after the glance; arguments as for `LaneDetector.prepare`.
+
+        `glanced` is the horizon's row that the glance at the frame before saw. It is steadier than `horizon`, which
+        what is found on the road moves about, and a glance at the right place needs no second one.
+        """
+        if self.glance is None:
+            return self.detector.prepare(image, horizon, expected)
+        prior = yield from self.glance.look(image, horizon if glanced is None else glanced)
+        return replace(self.detector.prepare(image, horizon, expected, prior), glanced=prior.view.horizon)

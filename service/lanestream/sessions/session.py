@@ -18,10 +18,15 @@ _HORIZON_GAIN = 0.1
 
 @dataclass(frozen=True)
 class SessionState:
-    """What a session remembers, as a small value: the size (width, height) of its frames, its horizon, its tracker."""
+    """What a session remembers, as a small value.
+
+    That is the size (width, height) of its frames, its horizon and the one that was last seen at a glance (both as
+    shares of the height), and its tracker.
+    """
 
     size: tuple[int, int] | None
     horizon: float | None
+    glanced: float | None
     evidence: float
     tracker: TrackerState
 
@@ -39,6 +44,7 @@ class Session:
         self.network: Network = pipeline.network
         self._configured = horizon
         self._estimate: float | None = None
+        self._glanced: float | None = None
         self._evidence = 0.0
         self._size: tuple[int, int] | None = None
         self._tracker = LaneTracker()
@@ -46,7 +52,7 @@ class Session:
     @property
     def state(self) -> SessionState:
         """All that it remembers. Not to be asked for while a frame is being concluded."""
-        return SessionState(self._size, self._estimate, self._evidence, self._tracker.state)
+        return SessionState(self._size, self._estimate, self._glanced, self._evidence, self._tracker.state)
 
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
         """Goes on where `state` was taken; `ids_lost` as for `LaneTracker.restored`. Raises ValueError for a bad one.
@@ -55,6 +61,7 @@ class Session:
         """
         self._tracker = LaneTracker.restored(state.tracker, ids_lost)
         self._size, self._estimate, self._evidence = state.size, state.horizon, state.evidence
+        self._glanced = state.glanced
 
     def follow(self, image: Image, timestamp: float) -> Steps[FrameResult]:
         """One frame of the camera, from a BGR image (H, W, 3) uint8 to its lanes; `timestamp` as for `conclude`.
@@ -69,8 +76,13 @@ class Session:
         """The first half of a frame: network inputs from a BGR image (H, W, 3) uint8. Leaves the session as it is."""
         height = image.shape[0]
         share = self._configured if self._configured is not None else self._estimate
-        expected = self._tracker.curves if self._size == (image.shape[1], height) else ()
-        return self._pipeline.prepare(image, None if share is None else share * height, expected)
+        known = self._size == (image.shape[1], height)
+        return self._pipeline.prepare(
+            image,
+            horizon=None if share is None else share * height,
+            expected=self._tracker.curves if known else (),
+            glanced=None if self._glanced is None or not known else self._glanced * height,
+        )
 
     def conclude(self, prepared: Prepared, outputs: NDArray[np.float32], timestamp: float) -> FrameResult:
         """The second half: detections from the network's outputs, then one step of the tracker.
@@ -83,6 +95,7 @@ class Session:
             self._tracker = LaneTracker()
             self._estimate, self._evidence = None, 0.0
         self._size = (view.width, view.height)
+        self._glanced = None if prepared.glanced is None else prepared.glanced / view.height
         self._steady_horizon(findings)
         return self._tracker.update(findings.detections, timestamp, findings.view)
 
