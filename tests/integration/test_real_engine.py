@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import CanvasInfo, RegressorInfo
 from lanestream.inference.model_info import METADATA_KEY
 from lanestream.local import LocalEngine
-from lanestream.protocol import LanesMessage
+from lanestream.protocol import DetectorName, LanesMessage
+from lanestream.runtime import Provider
 from lanestream_client import LaneClient, SourceFrame
 from lanestream_client.in_process import InProcess
 from lanestream_client.service import ServiceInfo
@@ -103,6 +105,31 @@ def test_a_stream_in_process_gives_the_same(real_url: str, real_engine: Engine, 
         assert without_timing(client.detect(drive[0])) == remote[0]
     assert [without_timing(result.lanes) for result in local.stream(frames(drive))] == remote
     assert without_timing(local.detect(drive[0])) == remote[0]
+
+
+@pytest.mark.parametrize("provider", ["cpu", "openvino"])
+def test_interleaved_streams_give_exactly_what_separate_ones_give(
+    serve: Serve, drive: list[bytes], provider: Provider
+) -> None:
+    if provider == "openvino":
+        pytest.importorskip("openvino")
+    place = serve(load_engine(None, provider))
+    # Each differs from the others in where it begins and in what finds its lanes; their frames meet in the batches.
+    drives: list[tuple[list[bytes], DetectorName]] = [
+        (drive, "candidates"),
+        (drive[::-1], "candidates"),
+        (drive[len(drive) // 2 :] * 2, "candidates"),
+        (drive, "regression"),
+    ]
+
+    def follow(one: tuple[list[bytes], DetectorName]) -> list[dict[str, Any]]:
+        with LaneClient(place) as client:
+            results = client.stream(frames(one[0]), mode="all", detector=one[1])
+            return [without_timing(result.lanes) for result in results]
+
+    separate = [follow(one) for one in drives]
+    with ThreadPoolExecutor(len(drives)) as together:
+        assert list(together.map(follow, drives)) == separate
 
 
 def test_a_regressor_beside_the_model_is_a_detector_of_its_own(
