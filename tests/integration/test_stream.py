@@ -274,6 +274,19 @@ def test_an_image_of_too_many_bytes_costs_itself_and_one_far_beyond_them_the_soc
         assert closed(socket)[0] == 1009
 
 
+def test_an_image_may_come_in_pieces(url: str) -> None:
+    image = fakes.image_file()
+    with stream(url, mode="all") as socket:
+        socket.send([image[:100], b"", image[100:200], image[200:]])
+        assert heard(socket)["type"] == "lanes"
+
+
+def test_a_text_that_is_none_ends_the_stream(url: str) -> None:
+    with stream(url, mode="all") as socket:
+        socket.send(b"\xff\xfe", text=True)
+        assert closed(socket)[0] == 1007
+
+
 def test_a_stream_beyond_the_limit_is_refused_until_one_ends(serve: Serve) -> None:
     place = serve(fakes.engine(), max_sessions=1)
     with stream(place, mode="all") as first:

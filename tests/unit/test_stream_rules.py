@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lanestream.errors import IdleError, OverrunError, ProtocolError, TooOldError
 from lanestream.protocol import FrameMessage, Mode, StartMessage
-from lanestream.sessions.stream_rules import Outcome, StreamLimits, StreamRules, check_age
+from lanestream.sessions.stream_rules import IncomingFrame, Outcome, StreamLimits, StreamRules, check_age
 
 
 def opened(mode: Mode, most: int = 3) -> StreamRules:
@@ -144,38 +146,76 @@ def test_nothing_may_follow_the_end() -> None:
     assert counts(rules) == (0, 0, 0, 0)
 
 
-@given(mode=st.sampled_from(["latest", "all"]), steps=st.lists(st.sampled_from("rtsf"), max_size=60))
-def test_every_frame_is_answered_failed_or_dropped(mode: Mode, steps: list[str]) -> None:
-    rules = opened(mode, most=4)
-    order: list[int] = []
-    busy = False
+class Driver:
+    """Does what clients, the clock and the service do to a stream, in any order, and keeps its own account of it."""
 
-    def take() -> bool:
-        frame = rules.take()
-        if frame is not None:
-            order.append(frame.seq)
-        return frame is not None
+    def __init__(self, mode: Mode, frames_per_s: float) -> None:
+        self.rules = StreamRules(StreamLimits(credits=4, frames_per_s=frames_per_s, burst_s=1.0), now=100.0)
+        self.rules.start(StartMessage(mode=mode), 100.0)
+        self.now = 100.0
+        self.received = self.expired = 0
+        self.taken: list[IncomingFrame] = []
+        self.busy = self.draining = False
 
-    for step in steps:
+    def do(self, step: str) -> None:
+        self.now += 0.01
         if step == "r":
-            try:
-                rules.receive(b"x", 101.0)
-            except OverrunError:
-                assert mode == "all"
+            with suppress(OverrunError, ProtocolError):
+                self.rules.receive(b"x", self.now)
+                self.received += not self.rules.over
+        elif step == "e":
+            with suppress(ProtocolError):
+                self.rules.end(self.now)
+        elif step == "d":
+            self.draining = True
+            self.rules.drain()
         elif step == "t":
-            busy = take() or busy
-        elif busy:
-            rules.settle(Outcome.ANSWERED if step == "s" else Outcome.FAILED, 102.0)
-            busy = False
-    rules.end(101.0)
-    while not rules.finished:
-        if busy or take():
-            rules.settle(Outcome.ANSWERED, 102.0)
-            busy = False
-    frames, answered, failed, dropped = counts(rules)
-    assert frames == answered + failed + dropped
+            self.take()
+        elif self.busy:
+            self.settle({"s": Outcome.ANSWERED, "f": Outcome.FAILED, "x": Outcome.EXPIRED}[step])
+
+    def take(self) -> None:
+        frame = self.rules.take()
+        assert frame is None or not self.busy, "one frame is worked on at a time"
+        if frame is not None:
+            self.taken.append(frame)
+            self.busy = True
+
+    def settle(self, outcome: Outcome) -> None:
+        if self.taken[-1].refusal is not None:
+            outcome = Outcome.FAILED
+        self.expired += outcome is Outcome.EXPIRED
+        self.rules.settle(outcome, self.now)
+        self.busy = False
+
+    def finish(self) -> None:
+        """What a service does at the end of a stream, which its client or its own end brings about."""
+        if not self.draining:
+            self.do("e")
+        while not self.rules.finished:
+            self.take()
+            self.settle(Outcome.ANSWERED)
+        self.taken += self.rules.rest()
+
+
+@given(
+    mode=st.sampled_from(["latest", "all"]),
+    frames_per_s=st.sampled_from([3.0, 1000.0]),
+    steps=st.text("rrrrtttsssfxde", max_size=80),
+)
+def test_every_frame_is_answered_failed_or_dropped(mode: Mode, frames_per_s: float, steps: str) -> None:
+    driver = Driver(mode, frames_per_s)
+    for step in steps:
+        driver.do(step)
+    driver.finish()
+    frames, answered, failed, dropped = counts(driver.rules)
+    order = [frame.seq for frame in driver.taken]
+    assert driver.rules.finished
+    assert frames == driver.received == answered + failed + dropped
     assert order == sorted(set(order))
-    assert mode == "latest" or dropped == 0
+    assert len(order) == frames - (dropped - driver.expired), "all of them had their turn but those that were replaced"
+    assert mode == "latest" or dropped == driver.expired
+    assert all((frame.data == b"") == (frame.refusal is not None) for frame in driver.taken)
 
 
 def refused(rules: StreamRules) -> str | None:
