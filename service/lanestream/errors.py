@@ -245,9 +245,9 @@ def _kinds(root: type[LanestreamError]) -> Iterator[type[LanestreamError]]:
         yield from _kinds(kind)
 
 
-def one_line(error: BaseException) -> str:
-    """What `error` says, in one line of 200 characters at most."""
-    return " ".join(str(error).split())[:200]
+def one_line(told: object, most: int = 200) -> str:
+    """What an error or a text says, in one line of `most` characters, whoever had a part in its wording."""
+    return " ".join(str(told).split())[:most]
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from lanestream.errors import LanestreamError, ProtocolError
+from lanestream.errors import LanestreamError, ProtocolError, one_line
 
 SUBPROTOCOL: Final = "lanestream.v1"
 # What comes after it in the name of another subprotocol is an API key: browsers can't set headers on a WebSocket.
@@ -296,5 +296,6 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 def _first_problem(error: ValidationError) -> str:
     problem = error.errors(include_url=False, include_input=False)[0]
-    where = ".".join(str(part) for part in problem["loc"])
-    return f"{where}: {problem['msg']}" if where else problem["msg"]
+    # Both may quote what was sent, however long that is.
+    where, why = one_line(".".join(map(str, problem["loc"])), 80), one_line(problem["msg"])
+    return f"{where}: {why}" if where else why

@@ -72,6 +72,15 @@ def test_a_refused_image_is_counted_with_the_reason(serve: Serve, data: bytes, r
     assert value(found, "lane_refusals_total", code=code) == 1
 
 
+def test_a_path_that_is_not_there_is_counted_as_a_refusal(serve: Serve) -> None:
+    url = serve(fakes.engine())
+    httpx.get(f"{url}/nothing")
+    httpx.get(f"{url}/v1/detect")
+    found = samples(url)
+    assert value(found, "lane_refusals_total", code="not_found") == 1
+    assert value(found, "lane_refusals_total", code="method_not_allowed") == 1
+
+
 def test_what_runs_is_told_once_it_is_loaded(serve: Serve) -> None:
     name, labels = "lane_inference_provider_info", {"provider": "cpu", "device": "cpu", "precision": "unknown"}
     assert all(name != sample for sample, _ in samples(serve()))

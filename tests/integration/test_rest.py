@@ -73,7 +73,10 @@ def test_a_picture_can_be_had(url: str, accept: str, kind: bytes) -> None:
 
 
 def test_another_form_can_not(url: str) -> None:
-    assert problem(detect(url, fakes.image_file(), headers={"accept": "text/html"})) == (406, "not_acceptable")
+    for asked in ("text/html", "x" * 30_000):
+        refused = detect(url, fakes.image_file(), headers={"accept": asked})
+        assert problem(refused) == (406, "not_acceptable")
+        assert len(refused.text) < 400
 
 
 @pytest.mark.parametrize(
@@ -133,6 +136,9 @@ def test_an_error_of_our_own_is_no_traceback(url: str) -> None:
 
 def test_unknown_paths_and_methods_are_told_alike(url: str) -> None:
     assert problem(httpx.get(f"{url}/nothing")) == (404, "not_found")
+    odd = httpx.get(f"{url}/no%0athing/{'x' * 5000}")
+    assert problem(odd) == (404, "not_found")
+    assert len(odd.text) < 400
     refused = httpx.get(f"{url}/v1/detect")
     assert problem(refused) == (405, "method_not_allowed")
     assert refused.headers["allow"] == "POST"

@@ -140,6 +140,9 @@ BAD_TEXTS = [
     '{"type": "frame", "timestamp": 1e300}',
     '{"type": "frame", "timestamp": NaN}',
     "[" * 100_000,
+    json.dumps({"type": "start", "a\nkey": 1}),
+    json.dumps({"type": "start", "k" * 100_000: 1}),
+    json.dumps({"type": "a\nkind" * 10_000}),
 ]
 
 
@@ -151,6 +154,7 @@ def test_a_bad_text_is_told_and_costs_nothing(url: str) -> None:
             assert (told["type"], told["code"], told["fatal"]) == ("error", "bad_message", False)
             assert told["message"]
             assert "\n" not in told["message"]
+            assert len(told["message"]) < 400, "what was sent is not sent back"
         socket.send(fakes.image_file())
         assert heard(socket)["seq"] == 0
 

@@ -61,7 +61,7 @@ messages = starts | frames
 names = st.sampled_from(
     ["type", "mode", "seq", "timestamp", "horizon", "camera", "session", "resume_token", "detector", "else"]
 )
-spoiled = st.builds(lambda message, name, value: {**message, name: value}, messages, names, junk)
+spoiled = st.builds(lambda message, name, value: {**message, name: value}, messages, names | st.text(max_size=9), junk)
 texts = st.one_of(
     messages.map(json.dumps),
     spoiled.map(json.dumps),

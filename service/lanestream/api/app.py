@@ -18,7 +18,7 @@ from lanestream import __version__
 from lanestream.api import rest, stream
 from lanestream.api.problems import Problem, problem_of, problem_response
 from lanestream.api.service import Draw, Service
-from lanestream.errors import LanestreamError, ProtocolError
+from lanestream.errors import LanestreamError, ProtocolError, one_line
 from lanestream.protocol import error_message
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ async def _tell_http(request: Request, error: Exception) -> JSONResponse:
     code = HTTPStatus(error.status_code).name.lower()
     request.app.state.service.metrics.refused(code)
     # The path as it came: what `request.url` reads can be bent by the Host header.
-    message = f"{request.method} {request.scope['path']}: {error.detail}"
+    message = one_line(f"{request.method} {one_line(request.scope['path'], 80)}: {error.detail}")
     answer = problem_response(error.status_code, Problem(code=code, message=message, hint="see /docs"))
     answer.headers.update(error.headers or {})
     return answer

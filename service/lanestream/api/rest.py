@@ -15,7 +15,7 @@ from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
 from lanestream.api.service import Service
 from lanestream.asyncapi import document
-from lanestream.errors import NotAcceptableError
+from lanestream.errors import NotAcceptableError, one_line
 from lanestream.messages import lanes_message
 from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
 from lanestream.sessions.caller import Caller
@@ -217,7 +217,9 @@ def _answer_form(request: Request, draw: Draw | None) -> str:
     offered = [_JSON, *_PICTURES] if draw is not None else [_JSON]
     form = preferred(request.headers.get("accept", "*/*"), offered)
     if form is None:
-        raise NotAcceptableError(f"no answer as {request.headers['accept']!r}", f"{', '.join(offered)} can be had")
+        raise NotAcceptableError(
+            f"no answer as {one_line(request.headers['accept'], 80)!r}", f"{', '.join(offered)} can be had"
+        )
     return form
 
 
