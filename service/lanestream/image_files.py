@@ -34,9 +34,10 @@ _MOST_PNG_CHUNKS: Final = 10_000
 _PNG_KEPT: Final = frozenset({b"tRNS", b"eXIf"})
 _PNG_OPTIONAL: Final = 0x20
 _PNG_CHANNELS: Final = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-# Deflate makes of one byte that many at most; a decoder inflates all of them, also those that are no pixels.
+# Deflate makes of one byte that many at most; a decoder inflates all of them, also those that are no pixels. What that
+# costs in vain is less than a second; to make sure of less would cost every PNG of a camera as much as its decoding.
 _DEFLATE_RATIO: Final = 1032
-_INFLATED_FOR_NOTHING: Final = 1 << 26
+_INFLATED_FOR_NOTHING: Final = 1 << 30
 _INFLATE_STEP: Final = 1 << 18
 
 _BINARY: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
