@@ -30,7 +30,7 @@ class FakeDetector:
     ) -> Prepared:
         height, width = image.shape[:2]
         view = RoadView(width, height, 0.4 * height if horizon is None else horizon)
-        return Prepared(image, np.zeros((2, 8, 8, 3), np.uint8), view, (), 1.0)
+        return Prepared(image, (lambda: np.zeros((2, 8, 8, 3), np.uint8),), view, (), 1.0)
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
         if prepared.image.min() == 255:

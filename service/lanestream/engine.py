@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from lanestream.detection import LaneDetector, Network, Pipeline
+from lanestream.detection import LaneDetector, Network, Pipeline, in_one
 from lanestream.detection.detector import CandidateDetector
 from lanestream.detection.prior import RoadGlance
 from lanestream.detection.regression import RegressionDetector
@@ -60,7 +60,7 @@ class Engine:
 
     def process(self, session: Session, image: Image, timestamp: float) -> FrameResult:
         """One frame from image to lanes, in the calling thread, with the milliseconds of each stage."""
-        walk = FrameWalk(session.follow(image, timestamp))
+        walk = FrameWalk(in_one(session.follow(image, timestamp)))
         question = walk.go()
         inferring = 0.0
         while question is not None:

@@ -113,11 +113,8 @@ class Settings(BaseSettings):
         default=None,
         description="Redis that keeps sessions for all replicas, redis://host:6379/0; in memory if absent.",
     )
-    threads: Annotated[int, Field(ge=1, le=256, description="Threads that decode, propose and track.")] = Field(
-        default_factory=processors
-    )
-    frames_at_once: Annotated[int, Field(ge=1, le=1024, description="Frames in work at a time; others wait.")] = Field(
-        default_factory=lambda: 2 * processors() + 2
+    threads: Annotated[int, Field(ge=1, le=256, description="Frames in work at a time, a thread each.")] = Field(
+        default_factory=lambda: processors() + 1
     )
     opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV takes for one image.")
 

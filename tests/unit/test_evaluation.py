@@ -237,7 +237,7 @@ def test_candidates_under_both_rules() -> None:
     # Across the line 10 px are 6.7 px, 52 px are 35 px (of 1280) and 90 px are 60 px.
     shifts = (0.0, 10.0, 52.0, 90.0)
     candidates = tuple(Candidate(curve(-1.1, 640.0 + v), 252.0, 719.0, 1.0) for v in shifts)
-    prepared = Prepared(np.zeros((720, 1280, 3), np.uint8), np.zeros((4, 8, 8, 3), np.uint8), view, candidates)
+    prepared = Prepared(np.zeros((720, 1280, 3), np.uint8), (), view, candidates)
     outputs = np.array([[0.05, 0.95], [0.75, 0.25], [0.05, 0.95], [0.85, 0.15]], np.float32)
     judged = judge(prepared, outputs, replace(prepared, candidates=candidates[::-1]), labels)
     figures = candidate_figures([Outcome(labels, (), judged)], 0.5)

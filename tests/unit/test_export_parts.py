@@ -137,8 +137,8 @@ def test_labels_that_are_all_alike_calibrate_nothing() -> None:
 
 def test_boundaries_of_two_answers_are_compared_in_columns() -> None:
     view = RoadView(640, 360, 160.0)
-    images = np.zeros((360, 640, 3), np.uint8), np.zeros((2, 224, 224, 3), np.uint8)
-    prepared = Prepared(*images, view, looks=(view,))
+    inputs = np.zeros((2, 224, 224, 3), np.uint8)
+    prepared = Prepared(np.zeros((360, 640, 3), np.uint8), (lambda: inputs,), view, looks=(view,))
     check = Check(2, (prepared, prepared), {})
     straight = [-0.3, -0.12, -0.05, 0.3, 0.12, 0.05, *[0.01] * 6, 0.9, 0.9, 0.0]
     both = np.array([straight, straight], np.float32)  # straight and mirrored, which are alike here

@@ -16,6 +16,7 @@ import cv2
 
 from bench.frames import FPS, Clips, to_and_fro
 from bench.orders import Answer, Order, Tally
+from lanestream.detection import in_one
 from lanestream.engine import Engine, load_engine
 from lanestream.imaging import ImageLimits, decode
 from lanestream.local import LocalCamera, LocalEngine
@@ -62,7 +63,7 @@ def patches_per_frame(engine: Engine, jpegs: Sequence[bytes]) -> float:
     session = engine.open_session()
     patches = 0
     for number, jpeg in enumerate(jpegs):
-        steps = session.follow(decode(jpeg, ImageLimits()), number / FPS)
+        steps = in_one(session.follow(decode(jpeg, ImageLimits()), number / FPS))
         try:
             question = next(steps)
             while True:
@@ -102,7 +103,7 @@ class Cameras:
             list(workers.map(self._loop, [cameras[thread::threads] for thread in range(min(threads, len(cameras)))]))
 
     async def _run(self) -> None:
-        runner = FrameRunner(self.settings.image_limits, self.settings.threads, self.settings.frames_at_once)
+        runner = FrameRunner(self.settings.image_limits, self.settings.threads)
         cameras = [asyncio.create_task(self._follow(runner, number)) for number in range(self.order.sessions)]
         stopped = asyncio.create_task(asyncio.to_thread(self.stopped.wait))
         done, _ = await asyncio.wait({stopped, *cameras}, return_when=asyncio.FIRST_COMPLETED)

@@ -11,7 +11,7 @@ from typing import Any, Final
 import litserve
 import numpy as np
 
-from lanestream.detection import Question, Steps
+from lanestream.detection import Question, Steps, in_one
 from lanestream.engine import load_engine
 from lanestream.imaging import ImageLimits, decode
 from lanestream.lanes import FrameResult, Image
@@ -57,12 +57,13 @@ _NO_TIMING: Final = dict.fromkeys(("decode", "propose", "queue", "infer", "track
 
 def in_step(frames: Sequence[Steps[FrameResult]]) -> list[FrameResult]:
     """The results of all frames, what they ask of one network at a time answered in one run."""
+    whole = [in_one(steps) for steps in frames]
     results: dict[int, FrameResult] = {}
     asked: dict[int, Question] = {}
 
     def go(index: int, answer: Any) -> None:
         try:
-            asked[index] = frames[index].send(answer)
+            asked[index] = whole[index].send(answer)
         except StopIteration as end:
             results[index] = end.value
 

@@ -86,7 +86,7 @@ class Service:
     def install(self, engine: Engine) -> None:
         """Makes the service ready with a warm engine."""
         settings = self.settings
-        runner = FrameRunner(settings.image_limits, settings.threads, settings.frames_at_once, self.metrics.batch)
+        runner = FrameRunner(settings.image_limits, settings.threads, self.metrics.batch)
         for pipeline in engine.pipelines:
             self.metrics.loaded(pipeline)
         self._loaded = Loaded(engine, runner)

@@ -7,9 +7,10 @@ told by generators, `Steps`: they yield questions and are sent the answers, and 
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,20 +27,27 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Prepared:
-    """A frame on its way through a detector: network inputs (N, H, W, 3) uint8, and what `finish` needs again.
+    """A frame on its way through a detector: network inputs, and what `finish` needs again.
 
-    `view` is the road view that the inputs were made in, and `horizon_weight` (0 to 1) tells how much of its horizon
-    was found in this frame. `looks` are the views of the inputs one by one, where each has its own. `glanced` is the
-    row of the horizon that a glance at the frame saw; None without one.
+    The inputs (N, H, W, 3) uint8 are made `parts` by part, so that a network can be at work on one while the next is
+    made; `inputs` are all of them. `view` is the road view that they were made in, and `horizon_weight` (0 to 1) tells
+    how much of its horizon was found in this frame. `looks` are the views of the inputs one by one, where each has its
+    own. `glanced` is the row of the horizon that a glance at the frame saw; None without one.
     """
 
     image: Image
-    inputs: NDArray[np.uint8]
+    parts: tuple[Callable[[], NDArray[np.uint8]], ...]
     view: RoadView
     candidates: tuple[Candidate, ...] = ()
     horizon_weight: float = 0.0
     looks: tuple[RoadView, ...] = ()
     glanced: float | None = None
+
+    @cached_property
+    def inputs(self) -> NDArray[np.uint8]:
+        """All network inputs (N, H, W, 3)."""
+        made = [part() for part in self.parts]
+        return made[0] if len(made) == 1 else np.concatenate(made)
 
 
 @dataclass(frozen=True)
@@ -120,21 +128,48 @@ class Network(Protocol):
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a network: inputs (N, H, W, 3) uint8, N may be 0. The answer is its outputs, row by row."""
+    """What is asked of a network: inputs (N, H, W, 3) uint8, N may be 0. The answer is its outputs, row by row.
+
+    Who asks and does not wait goes on with other work, and is sent nothing; the next question to the same network that
+    `waits` is sent the outputs of all of them, in order.
+    """
 
     network: Network
     inputs: NDArray[np.uint8]
+    waits: bool = True
 
 
 Steps = Generator[Question, NDArray[np.float32], T]
 
 
-def answered(steps: Steps[T]) -> T:
-    """What `steps` come to, each question answered at once in the calling thread."""
+# What a question is sent that does not wait.
+NO_OUTPUTS: Final[NDArray[np.float32]] = np.zeros((0, 0), np.float32)
+
+
+def in_one(steps: Steps[T]) -> Steps[T]:
+    """The same steps for those who answer at once: what was asked in parts is one question."""
+    parts = []
     try:
         question = next(steps)
         while True:
-            question = steps.send(question.network.run(question.inputs))
+            parts.append(question.inputs)
+            answer = NO_OUTPUTS
+            if question.waits:
+                inputs, parts = parts[0] if len(parts) == 1 else np.concatenate(parts), []
+                answer = yield Question(question.network, inputs)
+            question = steps.send(answer)
+    except StopIteration as end:
+        value: T = end.value
+        return value
+
+
+def answered(steps: Steps[T]) -> T:
+    """What `steps` come to, each question answered at once in the calling thread."""
+    whole = in_one(steps)
+    try:
+        question = next(whole)
+        while True:
+            question = whole.send(question.network.run(question.inputs))
     except StopIteration as end:
         value: T = end.value
         return value

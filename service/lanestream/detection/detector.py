@@ -53,7 +53,7 @@ class CandidateDetector:
         A `prior` tells where to look; without one, edges and ridges alone do.
         """
         proposals = self.search.propose(image, horizon, expected, prior)
-        patches = self.cutter.cut(image, proposals.candidates, proposals.view)
+        patches = self.cutter.parts(image, proposals.candidates, proposals.view)
         return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:

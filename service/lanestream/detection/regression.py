@@ -115,7 +115,7 @@ class RegressionDetector:
         detail = resized(image, scaling)
         straight = [self._canvas(detail, scaling, view) for view in looks]
         both = np.stack([*straight, *(cv2.flip(canvas, 1) for canvas in straight)])
-        return Prepared(image, both, looks[0], looks=looks)
+        return Prepared(image, (lambda: both,), looks[0], looks=looks)
 
     def read(self, prepared: Prepared, outputs: NDArray[np.float32]) -> tuple[RoadReading, RoadView]:
         """The reading of the look that the network is surest of, and the view with the horizon that it saw."""

@@ -5,8 +5,9 @@ Training and serving cut their patches here, so that the network sees in service
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,19 +20,36 @@ from lanestream.lanes import Candidate, Image
 
 @dataclass(frozen=True)
 class StripCutter:
-    """Cuts patches; images wider than `detail_width` are reduced to it first, or their near rows would alias."""
+    """Cuts patches, `at_once` of them at a time.
+
+    Images wider than `detail_width` are reduced to it first, or their near rows would alias.
+    """
 
     geometry: StripGeometry = StripGeometry()
     detail_width: int = 1280
+    at_once: int = 6
 
     def cut(self, image: Image, candidates: Sequence[Candidate], view: RoadView) -> NDArray[np.uint8]:
         """RGB patches (N, size, size, 3) uint8 of a BGR image (H, W, 3), in the order of `candidates`."""
-        size = self.geometry.size
-        if not candidates:
-            return np.zeros((0, size, size, 3), np.uint8)
+        return np.concatenate([part() for part in self.parts(image, candidates, view)])
+
+    def parts(
+        self, image: Image, candidates: Sequence[Candidate], view: RoadView
+    ) -> tuple[Callable[[], NDArray[np.uint8]], ...]:
+        """What cuts the patches, up to `at_once` of them each, in the order of `candidates`; at least one, of none."""
         scaling = Scaling(min(1.0, self.detail_width / view.width))
         detail = resized(image, scaling)
         detail_view = view.scaled(scaling, detail.shape[1], detail.shape[0])
+        starts = range(0, max(len(candidates), 1), self.at_once)
+        return tuple(
+            partial(self._cut, detail, candidates[start : start + self.at_once], detail_view, scaling)
+            for start in starts
+        )
+
+    def _cut(
+        self, detail: Image, candidates: Sequence[Candidate], detail_view: RoadView, scaling: Scaling
+    ) -> NDArray[np.uint8]:
+        size = self.geometry.size
         patches = np.empty((len(candidates), size, size, 3), np.uint8)
         grid, warped = np.empty((2, size, size), np.float32), np.empty((size, size, 3), np.uint8)
         for candidate, patch in zip(candidates, patches, strict=True):

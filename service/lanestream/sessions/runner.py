@@ -1,7 +1,7 @@
 """The way of a frame through the threads, so that the event loop never decodes, proposes, infers or tracks.
 
-A small pool does what OpenCV and numpy do; what a frame asks the networks goes to the batcher, where the questions of
-all sessions meet.
+A frame has a thread of a small pool for its whole way; what it asks the networks goes to the batcher, where the
+questions of all sessions meet.
 """
 
 from __future__ import annotations
@@ -9,20 +9,21 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
+import numpy as np
+
+from lanestream.detection import NO_OUTPUTS
 from lanestream.errors import ExpiredError
 from lanestream.imaging import ImageLimits, decode
-from lanestream.inference.batcher import Batcher, BatchReport
+from lanestream.inference.batcher import Answer, Batcher, BatchReport
 from lanestream.messages import ProcessedFrame
 from lanestream.sessions.walk import FrameWalk
 
 if TYPE_CHECKING:
-    from lanestream.detection import Question
-    from lanestream.lanes import Image
     from lanestream.sessions.session import Session
 
 P = ParamSpec("P")
@@ -42,33 +43,17 @@ class EncodedFrame:
     deadline: float | None = None
 
 
-@dataclass(frozen=True)
-class _Begun:
-    """A decoded frame at its first question."""
-
-    image: Image
-    walk: FrameWalk
-    question: Question | None
-    decode_s: float
-
-
 class FrameRunner:
     """Takes encoded frames to their lanes; the frames of one session one at a time, those of different ones at once.
 
-    `at_once` frames are in work at a time: enough to keep the `threads` and the networks busy. The others wait for
-    their turn before anything is spent on them, so that however many there are, a frame that is begun is soon done.
-    `observe` is told of every batch that the networks run.
+    `threads` frames are in work at a time, a thread each: enough to keep the processors and the networks busy. The
+    others wait for their turn before anything is spent on them, so that however many there are, a frame that is begun
+    is soon done. `observe` is told of every batch that the networks run.
     """
 
-    def __init__(
-        self,
-        limits: ImageLimits,
-        threads: int,
-        at_once: int,
-        observe: Callable[[BatchReport], None] | None = None,
-    ) -> None:
+    def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._limits = limits
-        self._turns = asyncio.Semaphore(at_once)
+        self._turns = asyncio.Semaphore(threads)
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
         self._batcher = Batcher(observe)
 
@@ -82,19 +67,10 @@ class FrameRunner:
         Raises ImageError where the file is refused, ExpiredError where its deadline passes before the networks ran; the
         session is then as it was before.
         """
-        begun = await self.work(self._begin, session, frame)
-        question, inferring = begun.question, 0.0
-        while question is not None:
-            answer = await asyncio.wrap_future(self._batcher.ask(question, frame.deadline))
-            inferring += answer.ended - answer.started
-            question = await self.work(begun.walk.go, answer.outputs)
-        stages = {"decode": 1e3 * begun.decode_s, "infer": 1e3 * inferring, **begun.walk.timing_ms}
-        total = 1e3 * (time.monotonic() - frame.arrived)
-        timing = {**stages, "queue": max(0.0, total - sum(stages.values())), "total": total}
-        return ProcessedFrame(begun.image, replace(begun.walk.result, timing_ms=timing))
+        return await self.work(self._process, session, frame)
 
     async def work(self, step: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """What `step` returns, run in the pool."""
+        """What `step` returns, run in a thread of the pool."""
         return await asyncio.get_running_loop().run_in_executor(self._workers, lambda: step(*args, **kwargs))
 
     def close(self) -> None:
@@ -102,11 +78,33 @@ class FrameRunner:
         self._workers.shutdown(cancel_futures=True)
         self._batcher.close()
 
-    def _begin(self, session: Session, frame: EncodedFrame) -> _Begun:
+    def _process(self, session: Session, frame: EncodedFrame) -> ProcessedFrame:
         started = time.monotonic()
         if frame.deadline is not None and frame.deadline < started:
             raise ExpiredError("the frame waited too long", "send fewer frames a second")
         image = decode(frame.data, self._limits)
         decoded = time.monotonic()
         walk = FrameWalk(session.follow(image, frame.timestamp))
-        return _Begun(image, walk, walk.go(), decoded - started)
+        inferring = self._answer_all(walk, frame.deadline)
+        ended = time.monotonic()
+        stages = {"decode": 1e3 * (decoded - started), "infer": 1e3 * inferring, **walk.timing_ms}
+        total = 1e3 * (ended - frame.arrived)
+        timing = {**stages, "queue": max(0.0, total - sum(stages.values())), "total": total}
+        return ProcessedFrame(image, replace(walk.result, timing_ms=timing))
+
+    def _answer_all(self, walk: FrameWalk, deadline: float | None) -> float:
+        """Goes through all questions of a frame; the seconds for which the networks kept it waiting."""
+        inferring = 0.0
+        asked: list[Future[Answer]] = []
+        question = walk.go()
+        while question is not None:
+            asked.append(self._batcher.ask(question, deadline))
+            outputs = NO_OUTPUTS
+            if question.waits:
+                since = time.monotonic()
+                answers = [each.result() for each in asked]
+                # While the frame was at work itself, and while others had their turn, it was not the networks.
+                inferring += sum(max(0.0, answer.ended - max(answer.started, since)) for answer in answers)
+                outputs, asked = np.concatenate([answer.outputs for answer in answers]), []
+            question = walk.go(outputs)
+        return inferring

@@ -69,7 +69,10 @@ class Session:
         The session is left as it was until the last answer has come.
         """
         prepared = yield from self.prepare(image)
-        outputs = yield Question(self.network, prepared.inputs)
+        *first, last = prepared.parts
+        for part in first:
+            yield Question(self.network, part(), waits=False)
+        outputs = yield Question(self.network, last())
         return self.conclude(prepared, outputs, timestamp)
 
     def prepare(self, image: Image) -> Steps[Prepared]:
