@@ -25,8 +25,16 @@ class FakeDetector:
 
     slopes: tuple[float, ...] = (-1.15, 1.15)
 
+    def survey(self, image: Image, horizon: float | None = None) -> None:
+        pass
+
     def prepare(
-        self, image: Image, horizon: float | None = None, expected: Sequence[Curve] = (), prior: object = None
+        self,
+        image: Image,
+        horizon: float | None = None,
+        expected: Sequence[Curve] = (),
+        prior: object = None,
+        survey: object = None,
     ) -> Prepared:
         height, width = image.shape[:2]
         view = RoadView(width, height, 0.4 * height if horizon is None else horizon)

@@ -20,9 +20,11 @@ from lanestream.lanes import Candidate, Curve, Detection, Image
 from lanestream.protocol import DetectorName
 
 if TYPE_CHECKING:
+    from lanestream.detection.candidates import Survey
     from lanestream.detection.prior import RoadGlance, RoadPrior
 
 T = TypeVar("T")
+U = TypeVar("U")
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,11 @@ class Findings:
 
 
 class LaneDetector(Protocol):
-    """The two halves of a detector. Both are pure and may run in any thread."""
+    """The two halves of a detector. All is pure and may run in any thread."""
+
+    def survey(self, image: Image, horizon: float | None = None) -> Survey | None:
+        """What `prepare` can do of its work before a glance at the frame is answered; None where that is nothing."""
+        ...
 
     def prepare(
         self,
@@ -71,10 +77,12 @@ class LaneDetector(Protocol):
         horizon: float | None = None,
         expected: Sequence[Curve] = (),
         prior: RoadPrior | None = None,
+        survey: Survey | None = None,
     ) -> Prepared:
         """Network inputs for a BGR image; `horizon` is its row, give or take a nod of the camera, where it is known.
 
-        `expected` are the boundaries of the frame before, in image pixels; `prior` is what a glance at the frame told.
+        `expected` are the boundaries of the frame before, in image pixels; `prior` is what a glance at the frame told,
+        and `survey` what was found meanwhile, with the same horizon.
         """
         ...
 
@@ -175,6 +183,19 @@ def answered(steps: Steps[T]) -> T:
         return value
 
 
+def beside(steps: Steps[T], work: Callable[[], U]) -> Steps[tuple[T, U]]:
+    """The same steps, and what `work` comes to, which is done while the first question is being answered."""
+    first = next(steps)
+    yield replace(first, waits=False)
+    done = work()
+    outputs = yield replace(first, inputs=first.inputs[:0])
+    try:
+        while True:
+            outputs = yield steps.send(outputs)
+    except StopIteration as end:
+        return end.value, done
+
+
 @dataclass(frozen=True)
 class Pipeline:
     """A detector with the network that answers it, by the name that users ask for it.
@@ -201,5 +222,7 @@ class Pipeline:
         """
         if self.glance is None:
             return self.detector.prepare(image, horizon, expected)
-        prior = yield from self.glance.look(image, horizon if glanced is None else glanced)
-        return replace(self.detector.prepare(image, horizon, expected, prior), glanced=prior.view.horizon)
+        looking = self.glance.look(image, horizon if glanced is None else glanced)
+        prior, survey = yield from beside(looking, lambda: self.detector.survey(image, horizon))
+        prepared = self.detector.prepare(image, horizon, expected, prior, survey)
+        return replace(prepared, glanced=prior.view.horizon)

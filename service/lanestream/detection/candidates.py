@@ -42,6 +42,18 @@ class Proposals:
 
 
 @dataclass(frozen=True)
+class Survey:
+    """What a frame shows before anything is known of its road: the working image, and where a horizon is known, lines.
+
+    `grey` (H, W) is the image at the working size of `scaling`; `lines` are the Hough lines below the horizon.
+    """
+
+    grey: Image
+    scaling: Scaling
+    lines: HoughLines | None
+
+
+@dataclass(frozen=True)
 class CandidateSearch:
     """How candidates are found: Hough lines and their pairs, lines of the fan, then suppression.
 
@@ -69,28 +81,39 @@ class CandidateSearch:
     separation: float = 0.05
     unguided: float = 0.6
 
+    def survey(self, image: Image, horizon: float | None = None) -> Survey:
+        """What can be seen of a BGR image (H, W, 3) uint8 before there is a prior; `horizon` as for `propose`."""
+        scaling = Scaling(WORKING_WIDTH / image.shape[1])
+        grey = paint_grey(resized(image, scaling))
+        if horizon is None:
+            return Survey(grey, scaling, None)
+        top = min(scaling.to_working(horizon), LOWEST_HORIZON * len(grey))
+        return Survey(grey, scaling, self._edges_and_lines(grey, top))
+
     def propose(
         self,
         image: Image,
         horizon: float | None = None,
         expected: Sequence[Curve] = (),
         prior: RoadPrior | None = None,
+        survey: Survey | None = None,
     ) -> Proposals:
         """The candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where that is known.
 
-        `expected` are boundaries that the last frames had. They are candidates before all others: what is still there
-        need not be found anew. A `prior` that saw a boundary gives the perspective, candidates of its own, those of
-        the next lanes, and an order for the rest; one that saw none is as good as none. Of a frame whose horizon is
-        unknown the prior is trusted less: what is found without it is proposed too.
+        `survey` is the image's, with the same horizon, where that was made before. `expected` are boundaries that the
+        last frames had. They are candidates before all others: what is still there need not be found anew. A `prior`
+        that saw a boundary gives the perspective, candidates of its own, those of the next lanes, and an order for the
+        rest; one that saw none is as good as none. Of a frame whose horizon is unknown the prior is trusted less: what
+        is found without it is proposed too.
         """
         height, width = image.shape[:2]
-        scaling = Scaling(WORKING_WIDTH / width)
-        grey = paint_grey(resized(image, scaling))
+        survey = survey or self.survey(image, horizon)
+        grey, scaling = survey.grey, survey.scaling
         guide = prior if prior is not None and prior.curves else None
         if guide is None:
-            point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon))
+            point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon), survey.lines)
         else:
-            point, lines = self._seen_road(grey, guide, scaling)
+            point, lines = self._seen_road(survey, guide)
         view = RoadView(grey.shape[1], grey.shape[0], point.y)
         first = [Lines.along(expected, scaling, view)]
         found = [self._found(grey, view, point, lines)]
@@ -107,21 +130,23 @@ class CandidateSearch:
         limit = min(self.limit, self.followed) if expected else self.limit
         return Proposals(tuple(candidates[:limit]), image_view, point.weight)
 
-    def _seen_road(self, grey: Image, prior: RoadPrior, scaling: Scaling) -> tuple[Perspective, HoughLines]:
+    def _seen_road(self, survey: Survey, prior: RoadPrior) -> tuple[Perspective, HoughLines]:
         """The perspective of a prior, moved to where ridges gather, and the Hough lines below its horizon."""
+        grey = survey.grey
         height, width = grey.shape
-        guess = _perspective(prior, scaling, height)
+        guess = _perspective(prior, survey.scaling, height)
         ridges = find_ridges(grey, guess.y, self.near_prior.ridges)
         point = self.near_prior.refine(guess, ridges, width, height - 1.0, known=True)
-        return point, self._edges_and_lines(grey, point.y)
+        return point, survey.lines or self._edges_and_lines(grey, point.y)
 
-    def _road(self, grey: Image, horizon: float | None) -> tuple[Perspective, HoughLines]:
-        """The perspective of the working image and the Hough lines of its road."""
+    def _road(
+        self, grey: Image, horizon: float | None, lines: HoughLines | None = None
+    ) -> tuple[Perspective, HoughLines]:
+        """The perspective of the working image and the Hough lines of its road, where they are not known yet."""
         height, width = grey.shape
         lowest = LOWEST_HORIZON * height
         horizon = None if horizon is None else min(horizon, lowest)
-        top = int(horizon) if horizon is not None else int(0.42 * height)
-        lines = self._edges_and_lines(grey, top)
+        lines = lines or self._edges_and_lines(grey, 0.42 * height if horizon is None else horizon)
         first = self.vanishing.find(lines, width, height, horizon)
         guess = Perspective(first.x, first.y, 0.0, first.weight)
         ridges = find_ridges(grey, guess.y, self.perspective.ridges)

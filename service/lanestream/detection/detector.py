@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import Findings, Prepared
-from lanestream.detection.candidates import TOP_SHARE, CandidateSearch
+from lanestream.detection.candidates import TOP_SHARE, CandidateSearch, Survey
 from lanestream.detection.prior import RoadPrior
 from lanestream.detection.refinement import USUAL_LEANING, Refinement
 from lanestream.detection.strips import StripCutter
@@ -41,18 +41,23 @@ class CandidateDetector:
     alike: float = 0.25
     separation: float = 0.8
 
+    def survey(self, image: Image, horizon: float | None = None) -> Survey:
+        """What can be seen of a BGR image (H, W, 3) before there is a prior; `horizon` as for `prepare`."""
+        return self.search.survey(image, horizon)
+
     def prepare(
         self,
         image: Image,
         horizon: float | None = None,
         expected: Sequence[Curve] = (),
         prior: RoadPrior | None = None,
+        survey: Survey | None = None,
     ) -> Prepared:
         """Patches of the candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where known.
 
-        A `prior` tells where to look; without one, edges and ridges alone do.
+        A `prior` tells where to look; without one, edges and ridges alone do. `survey` is what `survey` found.
         """
-        proposals = self.search.propose(image, horizon, expected, prior)
+        proposals = self.search.propose(image, horizon, expected, prior, survey)
         patches = self.cutter.parts(image, proposals.candidates, proposals.view)
         return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)
 

@@ -95,18 +95,22 @@ class RegressionDetector:
     detail_width: int = 448
     refinement: Refinement = Refinement(reach=0.24, steps=(0.09, 0.06, 0.04, 0.04))
 
+    def survey(self, image: Image, horizon: float | None = None) -> None:
+        """Nothing: all that this detector does before it asks its network is the picture that it asks about."""
+
     def prepare(
         self,
         image: Image,
         horizon: float | None = None,
         expected: Sequence[Curve] = (),  # noqa: ARG002
         prior: object = None,  # noqa: ARG002
+        survey: object = None,  # noqa: ARG002
     ) -> Prepared:
         """Canonical pictures (2 N, size, size, 3) of a BGR image; `horizon` is about its row, where known.
 
         With a horizon N is 1, without one there is a look for each of `HORIZONS`. Every look is taken twice, straight
-        and mirrored: the network's errors are not the same in both. `expected` boundaries and a `prior` are of no use
-        here, because the network looks at every frame afresh.
+        and mirrored: the network's errors are not the same in both. `expected` boundaries, a `prior` and a `survey` are
+        of no use here, because the network looks at every frame afresh.
         """
         height, width = image.shape[:2]
         rows = [share * height for share in HORIZONS] if horizon is None else [horizon]

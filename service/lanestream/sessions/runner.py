@@ -98,13 +98,17 @@ class FrameRunner:
         asked: list[Future[Answer]] = []
         question = walk.go()
         while question is not None:
-            asked.append(self._batcher.ask(question, deadline))
+            # Who only collects what was asked before asks nothing.
+            if len(question.inputs) or not asked:
+                asked.append(self._batcher.ask(question, deadline))
             outputs = NO_OUTPUTS
             if question.waits:
                 since = time.monotonic()
                 answers = [each.result() for each in asked]
-                # While the frame was at work itself, and while others had their turn, it was not the networks.
-                inferring += sum(max(0.0, answer.ended - max(answer.started, since)) for answer in answers)
+                for answer in answers:
+                    # While the frame was at work itself, and while others had their turn, it was not the networks.
+                    inferring += max(0.0, answer.ended - max(answer.started, since))
+                    since = max(since, answer.ended)
                 outputs, asked = np.concatenate([answer.outputs for answer in answers]), []
             question = walk.go(outputs)
         return inferring
