@@ -217,7 +217,7 @@ class StreamHandler:
     async def _next_answer(self) -> Message:
         """The answer to the next frame. Which one that is shows when its turn has come: until then newer ones count."""
         self._rules.queue(True)
-        async with self._service.loaded.runner.turn():
+        async with self._service.loaded.runner.turn(fresh=self._rules.mode == "latest"):
             self._rules.queue(False)
             frame = self._rules.take()
             assert frame is not None  # noqa: S101 - of waiting frames one always stays

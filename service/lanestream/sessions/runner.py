@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractAsyncContextManager
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -48,18 +48,22 @@ class FrameRunner:
 
     `threads` frames are in work at a time, a thread each: enough to keep the processors and the networks busy. The
     others wait for their turn before anything is spent on them, so that however many there are, a frame that is begun
-    is soon done. `observe` is told of every batch that the networks run.
+    is soon done. Frames that are wanted fresh leave one thread alone: the last bit of throughput would cost them more
+    time than it is worth. `observe` is told of every batch that the networks run.
     """
 
     def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._limits = limits
         self._turns = asyncio.Semaphore(threads)
+        self._fresh_turns = asyncio.Semaphore(max(1, threads - 1))
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
         self._batcher = Batcher(observe)
 
-    def turn(self) -> AbstractAsyncContextManager[None]:
+    @asynccontextmanager
+    async def turn(self, *, fresh: bool = False) -> AsyncIterator[None]:
         """A place among the frames in work, first come, first served; to be had before `run`."""
-        return self._turns
+        async with self._fresh_turns if fresh else nullcontext(), self._turns:
+            yield
 
     async def run(self, session: Session, frame: EncodedFrame) -> ProcessedFrame:
         """The lanes of `frame`.
