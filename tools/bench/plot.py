@@ -55,7 +55,7 @@ def _rates(axes: Axes, told: Mapping[str, Any]) -> None:
     axes.set_xticks(counts, [str(count) for count in counts])
     axes.set_ylim(bottom=0.0)
     axes.set(title="Throughput: higher is better", xlabel="cameras at a time", ylabel="frames a second, all together")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="center right", bbox_to_anchor=(1.0, 0.68))
     axes.grid(alpha=0.3)
 
 
