@@ -111,8 +111,6 @@ def test_a_stream_in_process_gives_the_same(real_url: str, real_engine: Engine, 
 def test_interleaved_streams_give_exactly_what_separate_ones_give(
     serve: Serve, drive: list[bytes], provider: Provider
 ) -> None:
-    if provider == "openvino":
-        pytest.importorskip("openvino")
     place = serve(load_engine(None, provider))
     # Each differs from the others in where it begins and in what finds its lanes; their frames meet in the batches.
     drives: list[tuple[list[bytes], DetectorName]] = [

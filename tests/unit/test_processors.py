@@ -65,11 +65,12 @@ def test_a_quota_counts_below_the_affinity(monkeypatch: pytest.MonkeyPatch, shar
     assert processors() == expected
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system has no affinity")
-def test_affinity_is_the_schedulers() -> None:
-    before = os.sched_getaffinity(0)
-    try:
-        os.sched_setaffinity(0, {min(before)})
-        assert affinity() == processors() == 1
-    finally:
-        os.sched_setaffinity(0, before)
+def test_affinity_is_the_schedulers_for_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", {0: {2, 5}}.__getitem__, raising=False)
+    assert affinity() == 2
+
+
+def test_without_a_schedulers_affinity_all_processors_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 6)
+    assert affinity() == 6
