@@ -15,6 +15,7 @@ from scipy.io import savemat
 
 from lanestream.errors import LabelError
 from lanestream.lanes import Image
+from lanestream_exporter.datasets.checking import Check
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.reading import read_dataset, survey
 from lanestream_exporter.scenes import render_still, sample_clip, sample_scene, write_clip
@@ -62,6 +63,14 @@ def read(path: Path, form: str = "auto") -> list[LabelledFrame]:
         assert image.dtype == np.uint8
         frames.append(frame)
     return frames
+
+
+def check_of(path: Path, form: str = "auto") -> Check:
+    """What is said of a data set."""
+    check = Check()
+    for found in survey(path, form):
+        check.add(found)
+    return check
 
 
 def faults(path: Path, form: str = "auto") -> list[str]:

@@ -18,6 +18,7 @@ from labelfiles import (
     LEFT,
     WIDTH,
     Draw,
+    check_of,
     clip_record,
     cvat_image,
     drawer,
@@ -36,7 +37,6 @@ from labelfiles import (
 )
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.checking import Check
 from lanestream_exporter.datasets.polylines import sound
 from lanestream_exporter.datasets.reading import Sample, survey
 
@@ -285,9 +285,7 @@ def test_no_record_raises_anything_else(tmp_path_factory: pytest.TempPathFactory
     place = record if len(field) == 1 else record[field[0]][0]
     place[field[-1]] = data.draw(_JSON)
     (folder / ("labels.jsonl" if form == "clips" else "labels.json")).write_text(json.dumps(record))
-    check = Check()
-    for found in survey(folder, form):
-        check.add(found)
+    check = check_of(folder, form)
     assert len(check.faults) + check.contents.groups.total() >= 1
     assert check.contents.lines()
 

@@ -2,43 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from labelfiles import (
-    Draw,
-    clip_record,
-    drawer,
-    write_lines,
-)
+from labelfiles import Draw, check_of, clip_record, write_lines
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.checking import Check
-from lanestream_exporter.datasets.reading import read_dataset, survey
+from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.datasets.sheet import ContactSheet
 from lanestream_exporter.datasets.splits import refuse_leak, split_by_group
-
-
-@pytest.fixture
-def draw(tmp_path: Path) -> Draw:
-    return drawer(tmp_path)
-
-
-def checked(path: Path) -> Check:
-    check = Check()
-    for found in survey(path):
-        check.add(found)
-    return check
 
 
 def test_a_frame_that_is_labelled_twice_is_named(tmp_path: Path, draw: Draw) -> None:
     draw("a.jpg")
     write_lines(tmp_path / "labels.jsonl", *[clip_record(image="a.jpg")] * 2)
-    (fault,) = checked(tmp_path).faults
+    (fault,) = check_of(tmp_path).faults
     assert "labels.jsonl:2: a.jpg is labelled a second time, after" in str(fault)
 
 
@@ -49,7 +30,7 @@ def test_a_picture_of_two_drives_is_named(tmp_path: Path, draw: Draw) -> None:
         shutil.copy(tmp_path / "monday/a.jpg", tmp_path / name)
     names = "monday/a.jpg", "tuesday/b.jpg", "monday/c.jpg"
     write_lines(tmp_path / "labels.jsonl", *(clip_record(image=name) for name in names))
-    check = checked(tmp_path)
+    check = check_of(tmp_path)
     other, again = map(str, check.faults)
     assert "labels.jsonl:2: tuesday/b.jpg is the picture of" in other
     assert "/tuesday', not " in other
@@ -62,14 +43,14 @@ def test_leaks_between_two_sides_are_named(tmp_path: Path, draw: Draw) -> None:
     draw("val/tuesday/b.jpg")
     write_lines(tmp_path / "train" / "labels.jsonl", clip_record(image="monday/a.jpg", clip="road.mp4"))
     write_lines(tmp_path / "val" / "labels.jsonl", clip_record(image="tuesday/b.jpg", clip="street.mp4"))
-    train = checked(tmp_path / "train")
-    assert train.leaks(checked(tmp_path / "val")) == []
+    train = check_of(tmp_path / "train")
+    assert train.leaks(check_of(tmp_path / "val")) == []
     write_lines(tmp_path / "val" / "labels.jsonl", clip_record(image="tuesday/b.jpg", clip="road.mp4"))
-    (leak,) = train.leaks(checked(tmp_path / "val"))
+    (leak,) = train.leaks(check_of(tmp_path / "val"))
     assert "'road' is in both train and validation" in str(leak)
     shutil.copy(tmp_path / "train/monday/a.jpg", tmp_path / "val/tuesday/b.jpg")
     write_lines(tmp_path / "val" / "labels.jsonl", clip_record(image="tuesday/b.jpg", clip="street.mp4"))
-    (leak,) = train.leaks(checked(tmp_path / "val"))
+    (leak,) = train.leaks(check_of(tmp_path / "val"))
     assert "labels.jsonl:1: its picture is on the other side too" in str(leak)
 
 
@@ -121,23 +102,3 @@ def test_the_sheet_spreads_over_all_frames_and_shows_lanes(tmp_path: Path, draw:
     assert drawn.shape[1] == 6 * 320
     assert drawn[130, 90].max() > 100  # on the lane's second point
     assert drawn[40, 200].max() == 0
-
-
-@pytest.fixture(scope="session")
-def real() -> Path:
-    beside = Path(__file__).parents[3] / "shared" / "data"
-    root = Path(os.environ.get("LANESTREAM_DATA", beside))
-    if not (root / "tusimple" / "labels.jsonl").is_file():
-        pytest.skip(f"no labelled real frames in {root}; set LANESTREAM_DATA")
-    return root
-
-
-def test_the_real_labels_are_sound(real: Path) -> None:
-    tusimple = checked(real / "tusimple")
-    assert tusimple.faults == []
-    assert tusimple.contents.groups == {"tusimple 0313-1": 171}
-    assert tusimple.contents.lanes == {3: 26, 4: 145}
-    clip = checked(real / "udacity" / "labels" / "highway_concrete.jsonl")
-    assert clip.faults == []
-    assert clip.contents.groups == {"highway_concrete": 12}
-    assert clip.contents.sizes == {(1280, 720): 12}
