@@ -7,6 +7,7 @@ checkpoint loads as it is, and folding them leaves exactly the plain network.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,43 @@ from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lanestream.errors import CheckpointError
 
-INPUT_SIZE = 224
-
 # Added to a patch's contrast (1 is full scale), so that the noise of an empty patch is not blown up to a texture.
 LEAST_CONTRAST = 0.03
 
 _CONVOLUTIONS = (0, 3, 6, 8, 10)
+_CHANNELS = (64, 192, 384, 256, 256)
 _HIDDEN = (1, 4)
 _NORMS = ("norms.", "hidden_norms.")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How large an AlexNet is; torchvision's by default.
+
+    Inputs are `size` x `size` pixels, convolutions have the share `width` of the usual channels, and there are `hidden`
+    units in each hidden layer.
+    """
+
+    size: int = 224
+    width: float = 1.0
+    hidden: int = 4096
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Channels of the five convolutions."""
+        return tuple(round(self.width * channels) for channels in _CHANNELS)
+
+    @property
+    def features(self) -> int:
+        """How many numbers the convolutions make of an input."""
+        side = (self.size - 7) // 4 + 1
+        for _ in range(3):
+            side = (side - 3) // 2 + 1
+        return self.channels[-1] * side**2
+
+
+# The size of the seed's network, and of torchvision's checkpoints.
+FULL = Shape()
 
 
 class AlexNet(nn.Module):
@@ -32,39 +62,41 @@ class AlexNet(nn.Module):
     Without it most hidden units die in the first hundred steps.
     """
 
-    def __init__(self, classes: int = 2, normalised: bool = True, dropout: float = 0.5) -> None:
+    def __init__(self, classes: int = 2, shape: Shape = FULL, *, normalised: bool = True, dropout: float = 0.5) -> None:
         super().__init__()
+        self.shape = shape
+        first, second, third, fourth, last = shape.channels
         self.features = nn.Sequential(
-            nn.Conv2d(3, 64, 11, stride=4, padding=2),
+            nn.Conv2d(3, first, 11, stride=4, padding=2),
             nn.ReLU(),
             nn.MaxPool2d(3, stride=2),
-            nn.Conv2d(64, 192, 5, padding=2),
+            nn.Conv2d(first, second, 5, padding=2),
             nn.ReLU(),
             nn.MaxPool2d(3, stride=2),
-            nn.Conv2d(192, 384, 3, padding=1),
+            nn.Conv2d(second, third, 3, padding=1),
             nn.ReLU(),
-            nn.Conv2d(384, 256, 3, padding=1),
+            nn.Conv2d(third, fourth, 3, padding=1),
             nn.ReLU(),
-            nn.Conv2d(256, 256, 3, padding=1),
+            nn.Conv2d(fourth, last, 3, padding=1),
             nn.ReLU(),
             nn.MaxPool2d(3, stride=2),
         )
         self.norms = nn.ModuleDict(
             {str(i): nn.BatchNorm2d(self._convolution(i).out_channels) for i in _CONVOLUTIONS} if normalised else {}
         )
-        self.hidden_norms = nn.ModuleDict({str(i): nn.BatchNorm1d(4096) for i in _HIDDEN} if normalised else {})
+        self.hidden_norms = nn.ModuleDict({str(i): nn.BatchNorm1d(shape.hidden) for i in _HIDDEN} if normalised else {})
         self.classifier = nn.Sequential(
             nn.Dropout(dropout),
-            nn.Linear(256 * 6 * 6, 4096),
+            nn.Linear(shape.features, shape.hidden),
             nn.ReLU(),
             nn.Dropout(dropout),
-            nn.Linear(4096, 4096),
+            nn.Linear(shape.hidden, shape.hidden),
             nn.ReLU(),
-            nn.Linear(4096, classes),
+            nn.Linear(shape.hidden, classes),
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Logits (N, classes) of normalised RGB images (N, 3, 224, 224)."""
+        """Logits (N, classes) of normalised RGB images (N, 3, size, size)."""
         for index, layer in enumerate(self.features):
             x = layer(x)
             if str(index) in self.norms:
@@ -83,7 +115,7 @@ class AlexNet(nn.Module):
 
     def folded(self) -> AlexNet:
         """The same function as a plain AlexNet: each normalisation goes into the layer before it."""
-        plain = AlexNet(self.classes, normalised=False)
+        plain = AlexNet(self.classes, self.shape, normalised=False)
         plain.load_state_dict({k: v.clone() for k, v in self.state_dict().items() if not k.startswith(_NORMS)})
         for key, norm in self.norms.items():
             assert isinstance(norm, nn.BatchNorm2d)  # noqa: S101 - as above

@@ -61,8 +61,8 @@ def _moved(
     """Mirrors the patch; moves its top and its bottom sideways as candidates err; tilts false ones wholly."""
     if _happens(shares.flip, rng):
         patch = np.ascontiguousarray(patch[:, ::-1])
-    top, bottom = rng.uniform(-shares.jitter, shares.jitter, 2)
     height, width = patch.shape[:2]
+    top, bottom = width * rng.uniform(-shares.jitter, shares.jitter, 2)
     if not is_true and _happens(shares.shear, rng):
         tilt = rng.uniform(-_STEEPEST, _STEEPEST) * height / 2.0
         top, bottom = top - tilt, bottom + tilt

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from lanestream.errors import ExportError
 from lanestream.geometry import StripGeometry
+from lanestream_exporter.alexnet import FULL
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
 from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
@@ -32,7 +33,7 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
     """The strip geometry in `size=224,half_width=0.5,min_half_width=5`; what isn't named has its usual value."""
     if value is None:
         return None
-    given: dict[str, Any] = {}
+    given: dict[str, Any] = {"size": FULL.size}
     for part in filter(None, value.split(",")):
         key, _, number = (word.strip() for word in part.partition("="))
         if key not in _STRIP:

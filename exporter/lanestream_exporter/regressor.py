@@ -17,7 +17,7 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lanestream.detection.regression import ANCHORS
-from lanestream_exporter.alexnet import AlexNet
+from lanestream_exporter.alexnet import FULL, AlexNet
 from lanestream_exporter.canvases import SHARES
 
 # Standard deviations are told as logarithms in image widths, within what pixels and roads allow.
@@ -38,9 +38,9 @@ class LaneRegressor(nn.Module):
         super().__init__()
         trunk = AlexNet(normalised=normalised)
         self.features, self.norms = trunk.features, trunk.norms
-        self.hidden = nn.Sequential(nn.Dropout(dropout), *_linear(256 * 6 * 6, 4096, normalised), nn.ReLU())
-        self.shape = nn.Sequential(*_linear(4096, 16, normalised), nn.ReLU(), nn.Linear(16, 6))
-        self.doubts = nn.Linear(4096, 9)
+        self.hidden = nn.Sequential(nn.Dropout(dropout), *_linear(FULL.features, FULL.hidden, normalised), nn.ReLU())
+        self.shape = nn.Sequential(*_linear(FULL.hidden, 16, normalised), nn.ReLU(), nn.Linear(16, 6))
+        self.doubts = nn.Linear(FULL.hidden, 9)
 
     def forward(self, x: Tensor) -> Tensor:
         """Raw outputs (N, 15) of normalised canvases (N, 3, 224, 224).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.candidates import CandidateSearch
-from lanestream.geometry import RoadView
+from lanestream.detection.strips import StripCutter
+from lanestream.geometry import RoadView, StripGeometry
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import Split, real_frames
@@ -19,6 +21,8 @@ from lanestream_exporter.patchstore import write_store
 from lanestream_exporter.scenefiles import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
 
+Frames = Iterable[tuple[LabelledFrame, Image]]
+
 _ROUNDS = 5
 
 # Sizes of rendered stills and how often each is drawn: cameras differ, and so does how sharp a strip is.
@@ -26,37 +30,43 @@ _SIZES = ((640, 360), (640, 480), (960, 540), (1280, 720))
 _SHARES = (0.4, 0.2, 0.25, 0.15)
 
 
-def rendered_stores(folder: Path, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
-    """Files of patches, the n-th from `scenes[n]` scenes and seeded by n; those already there are kept.
+@dataclass(frozen=True)
+class PatchStores:
+    """Files in `folder` with patches of `size` x `size` pixels; those already there are kept."""
 
-    `done` is called with the number of scenes of each file as it is finished.
-    """
-    return scene_files(folder, "rendered", scenes, _render_file, workers, done)
+    folder: Path
+    size: int
+
+    def rendered(self, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
+        """Files of patches, the n-th from `scenes[n]` scenes and seeded by n.
+
+        `done` is called with the number of scenes of each file as it is finished.
+        """
+        write = partial(_render_file, self.size)
+        return scene_files(self.folder, f"rendered-{self.size}", scenes, write, workers, done)
+
+    def real(self, root: Path, split: Split) -> Path:
+        """One file of patches from the labelled real frames of `split`."""
+        return self.labelled(f"real-{split}", lambda: real_frames(root, split), to_train=split == "train")
+
+    def labelled(self, name: str, frames: Callable[[], Frames], to_train: bool) -> Path:
+        """One file of patches, told by its `name`, from labelled frames and their BGR pictures.
+
+        Frames give their own candidates; those to train on also candidates beside their labels, a few times.
+        """
+        path = self.folder / f"{name}-{self.size}.npz"
+        if not path.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_store(path, _labelled_patches(self.size, frames(), to_train))
+        return path
 
 
-def real_store(folder: Path, root: Path, split: Split) -> Path:
-    """One file of patches from the labelled real frames of `split`; kept if it is already there."""
-    path = folder / f"real-{split}.npz"
-    if not path.exists():
-        labelled_store(path, real_frames(root, split), to_train=split == "train")
-    return path
+def _render_file(size: int, number: int, scenes: int, path: Path) -> None:
+    write_store(path, _rendered_patches(size, number, scenes))
 
 
-def labelled_store(path: Path, frames: Iterable[tuple[LabelledFrame, Image]], to_train: bool) -> None:
-    """Writes one file of patches from labelled frames and their BGR pictures.
-
-    Frames give their own candidates; those to train on also candidates beside their labels, a few times.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_store(path, _labelled_patches(frames, to_train))
-
-
-def _render_file(number: int, scenes: int, path: Path) -> None:
-    write_store(path, _rendered_patches(number, scenes))
-
-
-def _rendered_patches(number: int, scenes: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
-    maker = PatchMaker()
+def _rendered_patches(size: int, number: int, scenes: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
+    maker = PatchMaker(cutter=StripCutter(StripGeometry(size)))
     for index in range(scenes):
         rng = np.random.default_rng([number, index])
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
@@ -65,11 +75,10 @@ def _rendered_patches(number: int, scenes: int) -> Iterator[tuple[NDArray[np.uin
         yield from maker.all_of(still.image, still.labels, view, rng)
 
 
-def _labelled_patches(
-    frames: Iterable[tuple[LabelledFrame, Image]], to_train: bool
-) -> Iterator[tuple[NDArray[np.uint8], int]]:
+def _labelled_patches(size: int, frames: Frames, to_train: bool) -> Iterator[tuple[NDArray[np.uint8], int]]:
     # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
-    maker = PatchMaker(CandidateSearch(limit=32)) if to_train else PatchMaker()
+    search = CandidateSearch(limit=32) if to_train else CandidateSearch()
+    maker = PatchMaker(search, StripCutter(StripGeometry(size)))
     clear = partial(filter, lambda item: item[1] in (0, 1))
     for number, (frame, image) in enumerate(frames):
         rng = np.random.default_rng([number, 1])

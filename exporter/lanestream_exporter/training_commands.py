@@ -11,6 +11,7 @@ from types import FrameType
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from lanestream_exporter.rendering import PatchStores
 from lanestream_exporter.training.classifier import ClassifierTask, starting_network
 from lanestream_exporter.training.config import SHIPPED, ClassifierConfig, TrainConfig, read_config
 from lanestream_exporter.training.device import best_device, described
@@ -48,7 +49,8 @@ def classifier(config: Path, folder: Path, data: Path | None, patches: Path | No
     settings = read_config(config, ClassifierConfig)
     network = starting_network(settings)  # what is no checkpoint is told now, not after the patches have been made
     with _bar("rendering") as advance:
-        files = patch_files(settings.data, patches or folder / "patches", data, advance)
+        stores = PatchStores(patches or folder / "patches", settings.network.size)
+        files = patch_files(settings.data, stores, data, advance)
     sources = [part.read() for part in files]
     for source in sources:
         click.echo(f"{source.name}: {len(source.train)} patches to train on, {len(source.check)} to validate with")

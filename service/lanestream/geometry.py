@@ -131,10 +131,15 @@ class StripGeometry:
     candidates, as errors are counted across them; with 0 they are equally wide on the ground.
     """
 
-    size: int = 224
+    size: int = 112
     half_width: float = 0.33
     min_half_width: float = 4.0
     lean: float = 1.0
+
+    @property
+    def detail_width(self) -> int:
+        """How wide an image may be before the near rows of its strips alias: that of 640 pixels for patches of 112."""
+        return self.size * 40 // 7
 
     def rows(self, top: float, bottom: float) -> FloatArray:
         """Image rows of the patch rows, from the top of the patch to its bottom; shape (size,)."""

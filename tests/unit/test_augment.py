@@ -52,7 +52,7 @@ def test_a_flip_mirrors(patches: NDArray[np.uint8]) -> None:
 
 
 def test_the_line_of_a_true_patch_stays_within_the_jitter(patches: NDArray[np.uint8]) -> None:
-    shares = STILL.model_copy(update={"flip": 0.5, "jitter": 3.0, "shear": 1.0})
+    shares = STILL.model_copy(update={"flip": 0.5, "jitter": 3.0 / 224.0, "shear": 1.0})
     moved = augmented(patches, labels(1), shares, np.random.default_rng(0))
     off = np.array([centres(patch) - 111.5 for patch in moved])
     assert np.abs(off).max() <= 3.1

@@ -44,7 +44,7 @@ def test_an_oracle_network_gives_exact_boundaries(width: int, height: int) -> No
     still = fair_scene(width, height)
     detector = CandidateDetector()
     prepared = detector.prepare(still.image)
-    assert prepared.inputs.shape == (len(prepared.candidates), 224, 224, 3)
+    assert prepared.inputs.shape == (len(prepared.candidates), 112, 112, 3)
     verdicts = TruthRule(near=16.0).judge(prepared.candidates, still.labels, prepared.view)
     outputs = np.stack([verdicts != TRUE, verdicts == TRUE], axis=1).astype(np.float32)
     found = [Found(d.curve, d.top, d.bottom, 0) for d in detector.finish(prepared, outputs).detections]
@@ -108,11 +108,11 @@ def test_the_marking_stands_upright_in_its_patch() -> None:
         x = float(curve.x(y))
         image[y, max(0, round(x - half)) : round(x + half) + 1] = 230
     patch = StripCutter().cut(image, [Candidate(curve, 178.0, 359.0, 1.0)], RoadView(640, 360, 160.0))[0]
-    bright = patch[30:, :, 0] > 150
+    bright = patch[15:, :, 0] > 150
     centres = np.array([np.flatnonzero(row).mean() for row in bright])
     widths = bright.sum(axis=1)
-    np.testing.assert_allclose(centres, 111.5, atol=6.0)
-    np.testing.assert_allclose(widths[60:], 22.0, atol=6.0)
+    np.testing.assert_allclose(centres, 55.5, atol=3.0)
+    np.testing.assert_allclose(widths[30:], 11.0, atol=3.0)
 
 
 def test_patches_are_rgb() -> None:

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from lanestream.errors import CheckpointError
 from lanestream.geometry import StripGeometry
-from lanestream_exporter.alexnet import AlexNet, initialise
+from lanestream_exporter.alexnet import AlexNet, Shape, initialise
 from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
 from lanestream_exporter.exporting.classifier import ClassifierSubject
 from lanestream_exporter.training.checkpoints import read_checkpoint
 
 Weights = dict[str, Tensor]
 
-FOREIGN = Foreign(("false", "lane"), StripGeometry(half_width=0.4))
+FOREIGN = Foreign(("false", "lane"), StripGeometry(224, half_width=0.4))
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +74,16 @@ def test_what_the_trainer_recorded_goes_along(saved: Any) -> None:
     assert training == {**record, "step": 7, "figures": {"validation": 0.25}}
 
 
+def test_a_network_is_as_large_as_its_run_made_it(saved: Any) -> None:
+    shape = Shape(size=112, width=0.25, hidden=32)
+    record = {"config": {"network": {"size": 112, "width": 0.25, "hidden": 32}}}
+    subject, _ = read_subject(saved({"network": AlexNet(shape=shape).state_dict(), "record": record}))
+    assert isinstance(subject, ClassifierSubject)
+    assert (subject.network.shape, subject.strip.size) == (shape, 112)
+    with torch.inference_mode():
+        assert subject.network(torch.zeros(1, 3, 112, 112)).shape == (1, 2)
+
+
 def test_a_checkpoint_without_a_record_says_so(saved: Any, theirs: Weights) -> None:
     assert read_subject(saved({"network": theirs, "step": 3}))[1]["data"] == "not recorded"
 
@@ -94,7 +104,7 @@ def test_a_network_from_elsewhere_needs_only_classes_and_strips(saved: Any, thei
 
 
 def test_the_lane_is_the_second_class_wherever_it_was(saved: Any, theirs: Weights) -> None:
-    subject, _ = read_subject(saved(theirs), Foreign(("lane", "road"), StripGeometry()))
+    subject, _ = read_subject(saved(theirs), Foreign(("lane", "road"), StripGeometry(224)))
     assert isinstance(subject, ClassifierSubject)
     assert subject.classes == ("road", "lane")
     assert torch.equal(subject.network.classifier[6].bias.data, theirs["classifier.6.bias"].flip(0))
@@ -126,8 +136,8 @@ def test_networks_that_can_not_be_served_are_named(saved: Any, theirs: Weights) 
 @pytest.mark.parametrize(
     ("foreign", "words"),
     [
-        (Foreign(("false", "true"), StripGeometry()), "one of them lane"),
-        (Foreign(("none", "lane", "curb"), StripGeometry()), "can't be served"),
+        (Foreign(("false", "true"), StripGeometry(224)), "one of them lane"),
+        (Foreign(("none", "lane", "curb"), StripGeometry(224)), "can't be served"),
         (Foreign(("false", "lane"), StripGeometry(size=100)), "takes 224"),
     ],
 )

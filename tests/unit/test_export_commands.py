@@ -41,7 +41,7 @@ def test_strips_that_can_not_be_are_refused(tmp_path: Path, strip: str, words: s
 def test_a_strip_names_what_is_unusual() -> None:
     command = export_commands.export
     with command.make_context("export", ["a.pt", "b.onnx", "--strip", "half_width=0.4, lean=0"]) as context:
-        assert context.params["strip"] == StripGeometry(half_width=0.4, lean=0.0)
+        assert context.params["strip"] == StripGeometry(224, half_width=0.4, lean=0.0)
 
 
 def test_classes_and_strips_go_together(tmp_path: Path) -> None:

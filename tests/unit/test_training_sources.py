@@ -13,6 +13,7 @@ import pytest
 
 from lanestream.errors import LabelError
 from lanestream_exporter.patchstore import write_store
+from lanestream_exporter.rendering import PatchStores
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.training.config import Frames, PatchData
 from lanestream_exporter.training.ownframes import own_frames, own_stores
@@ -74,21 +75,21 @@ def test_named_validation_frames_are_kept_apart_and_a_leak_is_refused(tmp_path: 
 def test_patches_are_cut_once_and_anew_where_frames_change(tmp_path: Path) -> None:
     a, b = drive(tmp_path / "roads" / "one"), drive(tmp_path / "roads" / "three")
     data = own(a, validation=(b,))
-    first = own_stores(data, tmp_path / "patches")
+    first = own_stores(data, PatchStores(tmp_path / "patches", 112))
     before = [path.stat().st_mtime_ns for path in first]
-    assert own_stores(data, tmp_path / "patches") == first
+    assert own_stores(data, PatchStores(tmp_path / "patches", 112)) == first
     assert [path.stat().st_mtime_ns for path in first] == before
     record = json.loads((a / "0.json").read_text())
     (a / "0.json").write_text(json.dumps(record, indent=1))
-    assert own_stores(data, tmp_path / "patches") != first
+    assert own_stores(data, PatchStores(tmp_path / "patches", 112)) != first
 
 
 def test_rendered_scenes_are_shared_out_and_the_first_file_validates(tmp_path: Path) -> None:
     data = PatchData(rendered_scenes=3, validation_scenes=2, real_share=0.0, final_real_share=0.0)
     told: list[tuple[int, int]] = []
-    (files,) = patch_files(data, tmp_path, None, lambda more, total: told.append((more, total)))
+    (files,) = patch_files(data, PatchStores(tmp_path, 64), None, lambda more, total: told.append((more, total)))
     assert sum(more for more, _ in told) == told[-1][1] == 5
-    assert [path.name for path in (*files.check, *files.train)] == ["rendered-0000-2.npz", "rendered-0001-3.npz"]
+    assert [path.name for path in (*files.check, *files.train)] == ["rendered-64-0000-2.npz", "rendered-64-0001-3.npz"]
     source = files.read()
     assert source.counts["train"] == len(source.train) > len(source.check) > 0
     assert origin_of(data) == {"real_frames": "none", "rendered_scenes": 3}

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lanestream.detection.edges import WORKING_WIDTH, find_edges
 from lanestream.detection.hough import ExtendedHough
 from lanestream.lanes import Image
-from lanestream_exporter.alexnet import INPUT_SIZE, AlexNet
+from lanestream_exporter.alexnet import FULL, AlexNet
 
 HORIZON = 0.45  # a constant of one camera, as a share of the height
 OFFSET = 15  # pixels of a frame that is 640 wide
@@ -81,7 +81,7 @@ def masked_patch(image: Image, line: Line) -> Image:
     masked = image * mask
     left, right = np.clip((corners[:, 0].min(), corners[:, 0].max()), 0, width)
     crop = masked[int(top) :, left : max(right, left + 1)] if left < width else masked[int(top) :]
-    return np.asarray(cv2.resize(crop, (INPUT_SIZE, INPUT_SIZE)), np.uint8)
+    return np.asarray(cv2.resize(crop, (FULL.size, FULL.size)), np.uint8)
 
 
 @torch.inference_mode()
@@ -109,7 +109,7 @@ def create_app(most: int) -> FastAPI:
     app = FastAPI()
     torch.manual_seed(0)
     network = AlexNet(normalised=False).eval()
-    lane_probabilities(network, np.zeros((most, INPUT_SIZE, INPUT_SIZE, 3), np.uint8))
+    lane_probabilities(network, np.zeros((most, FULL.size, FULL.size, 3), np.uint8))
 
     @app.get("/readyz")
     async def ready() -> dict[str, str]:

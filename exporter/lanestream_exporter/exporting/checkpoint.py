@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lanestream.errors import CheckpointError
 from lanestream.geometry import StripGeometry
-from lanestream_exporter.alexnet import INPUT_SIZE, AlexNet, load_state
+from lanestream_exporter.alexnet import FULL, AlexNet, Shape, load_state
 from lanestream_exporter.exporting.classifier import ClassifierSubject
 from lanestream_exporter.exporting.regressor import RegressorSubject
 from lanestream_exporter.exporting.subject import Subject
@@ -44,7 +44,7 @@ def read_subject(path: Path, foreign: Foreign | None = None) -> tuple[Subject, d
     if "network" in state:
         if foreign is not None:
             raise CheckpointError(f"{path} is a checkpoint of this trainer", "leave --classes and --strip off")
-        return _own(path, state["network"]), _training(state)
+        return _own(path, state), _training(state)
     weights = _unwrapped(path, state)
     if foreign is None:
         raise CheckpointError(
@@ -54,12 +54,15 @@ def read_subject(path: Path, foreign: Foreign | None = None) -> tuple[Subject, d
     return _foreign(path, weights, foreign), {"data": "not recorded", "source": "a torchvision AlexNet from elsewhere"}
 
 
-def _own(path: Path, weights: Mapping[str, Tensor]) -> Subject:
+def _own(path: Path, state: Mapping[str, Any]) -> Subject:
+    weights = state["network"]
     if "shape.0.weight" in weights:
         regressor = LaneRegressor(normalised=_has_norms(weights))
         _load(path, regressor, weights)
         return RegressorSubject(regressor.eval().folded())
-    return ClassifierSubject(_alexnet(path, weights))
+    config = (state.get("record") or {}).get("config") or {}
+    shape = Shape(**config["network"]) if "network" in config else FULL
+    return ClassifierSubject(_alexnet(path, weights, shape), strip=StripGeometry(shape.size))
 
 
 def _foreign(path: Path, weights: Mapping[str, Tensor], foreign: Foreign) -> ClassifierSubject:
@@ -68,11 +71,11 @@ def _foreign(path: Path, weights: Mapping[str, Tensor], foreign: Foreign) -> Cla
         raise CheckpointError(
             f"the classes {', '.join(classes)} can't be served", f"two are, one of them {_LANE}, in the network's order"
         )
-    if foreign.strip.size != INPUT_SIZE:
+    if foreign.strip.size != FULL.size:
         raise CheckpointError(
-            f"strips of size {foreign.strip.size} don't fit AlexNet", f"its first hidden layer takes {INPUT_SIZE}"
+            f"strips of size {foreign.strip.size} don't fit AlexNet", f"its first hidden layer takes {FULL.size}"
         )
-    network = _alexnet(path, weights)
+    network = _alexnet(path, weights, FULL)
     other = classes[1 - classes.index(_LANE)]
     if classes[0] == _LANE:  # the service reads the lane's probability second
         last = network.classifier[6]
@@ -81,7 +84,7 @@ def _foreign(path: Path, weights: Mapping[str, Tensor], foreign: Foreign) -> Cla
     return ClassifierSubject(network, (other, _LANE), foreign.strip, foreign.normalisation)
 
 
-def _alexnet(path: Path, weights: Mapping[str, Tensor]) -> AlexNet:
+def _alexnet(path: Path, weights: Mapping[str, Tensor], shape: Shape) -> AlexNet:
     last = weights.get(_LAST)
     if not isinstance(last, Tensor) or last.ndim != 2:
         raise CheckpointError(f"{path} holds no AlexNet: there is no {_LAST}", "its keys must be torchvision's")
@@ -89,7 +92,7 @@ def _alexnet(path: Path, weights: Mapping[str, Tensor]) -> AlexNet:
         raise CheckpointError(
             f"{path} tells {len(last)} classes apart, and the service knows two", "fine-tune it with a last layer of 2"
         )
-    network = AlexNet(normalised=_has_norms(weights))
+    network = AlexNet(shape=shape, normalised=_has_norms(weights))
     _load(path, network, weights)
     return network.eval().folded()
 

@@ -18,7 +18,7 @@ from lanestream.detection.strips import StripCutter
 from lanestream.geometry import StripGeometry
 from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import ClassifierInfo, StripInfo
-from lanestream_exporter.alexnet import AlexNet
+from lanestream_exporter.alexnet import FULL, AlexNet
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import in_batches, truncated
 from lanestream_exporter.exporting.frames import FrameSource, LabelledJpeg, Part
@@ -52,7 +52,7 @@ class ClassifierSubject:
 
     network: AlexNet
     classes: tuple[str, str] = ("false", "lane")
-    strip: StripGeometry = StripGeometry()
+    strip: StripGeometry = StripGeometry(FULL.size)
     normalisation: str = "contrast"
     calibration: Calibration = Calibration()
 

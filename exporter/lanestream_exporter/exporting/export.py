@@ -122,9 +122,9 @@ def _files(subject: Subject, precision: Precision, ranging: NDArray[np.uint8], f
     """The fp32 file, which the others are measured against, and the one of `precision`."""
     files: dict[Precision, Path] = {name: folder / f"{name}.onnx" for name in ("fp32", precision)}
     names = subject.input_name, subject.output_name
-    write_graph(subject.served(), files["fp32"], *names)
+    write_graph(subject.served(), ranging, files["fp32"], names)
     if precision == "fp16":
-        write_graph(subject.served(half=True), files["fp16"], *names)
+        write_graph(subject.served(half=True), ranging, files["fp16"], names)
     if precision == "int8":
         quantized(files["fp32"], files["int8"], ranging, subject.exact)
     return files

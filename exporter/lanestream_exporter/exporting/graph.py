@@ -7,28 +7,30 @@ import os
 import warnings
 from pathlib import Path
 
+import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from lanestream.errors import ExportError
 from lanestream.inference import ModelInfo
 from lanestream.inference.model_info import METADATA_KEY
-from lanestream_exporter.alexnet import INPUT_SIZE
 
 
-def write_graph(served: nn.Module, path: Path, input_name: str, output_name: str) -> None:
-    """Writes `served`, uint8 (N, 224, 224, 3) in, for any N, to `path`."""
-    example = torch.zeros(2, INPUT_SIZE, INPUT_SIZE, 3, dtype=torch.uint8)
+def write_graph(served: nn.Module, example: NDArray[np.uint8], path: Path, names: tuple[str, str]) -> None:
+    """Writes `served` to `path`: uint8 inputs (N, H, W, 3) like `example`'s, for any N; `names` of input and output."""
+    # Of one input the exporter would make a graph for one alone.
+    inputs = torch.from_numpy(np.repeat(example[:1], 2, axis=0))
     # The exporter warns of its own innards and of torchvision's absence: nothing that a user could mend.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             served,
-            (example,),
-            input_names=[input_name],
-            output_names=[output_name],
+            (inputs,),
+            input_names=[names[0]],
+            output_names=[names[1]],
             dynamic_shapes=({0: torch.export.Dim("batch", min=1, max=1024)},),
             dynamo=True,
             verbose=False,

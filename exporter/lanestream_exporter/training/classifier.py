@@ -70,7 +70,7 @@ def starting_network(config: ClassifierConfig) -> AlexNet:
     where the file is neither.
     """
     torch.manual_seed(config.seed)
-    network = AlexNet()
+    network = AlexNet(shape=config.network.shape)
     if config.initial is None:
         return network
     weights = Path(config.initial)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat
 from pydantic import model_validator as checked
 
 from lanestream.errors import SettingsError
+from lanestream_exporter.alexnet import Shape
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -86,6 +87,19 @@ class Frames(Section):
     format: str = "auto"
 
 
+class NetworkSize(Section):
+    """How large the classifier is, as `alexnet.Shape` tells; its patches are of the same `size`."""
+
+    size: Annotated[int, Field(ge=63)] = 112
+    width: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    hidden: PositiveInt = 512
+
+    @property
+    def shape(self) -> Shape:
+        """The same for the network."""
+        return Shape(self.size, self.width, self.hidden)
+
+
 class PatchData(Section):
     """Where patches come from, and which share of each batch is real: `final_real_share` in the last third.
 
@@ -134,11 +148,11 @@ class Light(Section):
 class Augmentation(Section):
     """What patches are varied by. `flip` is a share of all and `shear` one of the false patches.
 
-    `jitter` is how far the top and the bottom of a patch move sideways at most, in pixels of the patch.
+    `jitter` is how far the top and the bottom of a patch move sideways at most, as a share of its width.
     """
 
     flip: Share = 0.5
-    jitter: Annotated[float, Field(ge=0.0, le=10.0)] = 3.0
+    jitter: Annotated[float, Field(ge=0.0, le=0.05)] = 0.013
     shear: Share = 0.1
     light: Light = Light()
 
@@ -147,6 +161,7 @@ class ClassifierConfig(TrainConfig):
     """The classifier's run."""
 
     label_smoothing: Share = 0.05
+    network: NetworkSize = NetworkSize()
     data: PatchData = PatchData()
     augmentation: Augmentation = Augmentation()
 

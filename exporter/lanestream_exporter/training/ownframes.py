@@ -10,7 +10,7 @@ from lanestream.lanes import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.datasets.splits import refuse_leak, split_by_group
-from lanestream_exporter.rendering import labelled_store
+from lanestream_exporter.rendering import PatchStores
 from lanestream_exporter.training.config import Frames, PatchData
 
 FrameStream = Iterator[tuple[LabelledFrame, Image]]
@@ -29,18 +29,14 @@ def own_frames(data: PatchData) -> tuple[FrameStream, FrameStream]:
     return _frames(data.train), _frames(data.validation)
 
 
-def own_stores(data: PatchData, folder: Path) -> tuple[Path, Path]:
-    """Files in `folder` with patches of the frames that `data` names: to train on, and to validate with.
+def own_stores(data: PatchData, stores: PatchStores) -> tuple[Path, Path]:
+    """Files of patches of the frames that `data` names: to train on, and to validate with.
 
     They are cut anew where the frames have changed. Raises LabelError as `own_frames` does.
     """
     key = _fingerprint(data)
-    train, check = (folder / f"own-{use}-{key}.npz" for use in ("train", "validation"))
-    if not (train.exists() and check.exists()):
-        to_train, to_check = own_frames(data)
-        labelled_store(train, to_train, to_train=True)
-        labelled_store(check, to_check, to_train=False)
-    return train, check
+    train = stores.labelled(f"own-train-{key}", lambda: own_frames(data)[0], to_train=True)
+    return train, stores.labelled(f"own-validation-{key}", lambda: own_frames(data)[1], to_train=False)
 
 
 def _frames(sources: Sequence[Frames]) -> FrameStream:

@@ -8,30 +8,32 @@ from typing import Any
 
 from lanestream.processors import processors
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.rendering import real_store, rendered_stores
+from lanestream_exporter.rendering import PatchStores
 from lanestream_exporter.scenefiles import files_of
 from lanestream_exporter.training.config import PatchData
 from lanestream_exporter.training.ownframes import own_stores
 from lanestream_exporter.training.patchfiles import PatchFiles
 
 
-def patch_files(data: PatchData, folder: Path, root: Path | None, done: Callable[[int, int], None]) -> list[PatchFiles]:
-    """The patches that `data` asks for, as files in `folder`; they are made where they are missing.
+def patch_files(
+    data: PatchData, stores: PatchStores, root: Path | None, done: Callable[[int, int], None]
+) -> list[PatchFiles]:
+    """The patches that `data` asks for, as files of `stores`; they are made where they are missing.
 
     `root` is the folder of the project's real frames, where it is not the default one. `done` is told (how many more
     scenes are rendered, how many there are). Raises LabelError for frames that can't be used.
     """
     files: list[PatchFiles] = []
     if data.train:
-        train, check = own_stores(data, folder)
+        train, check = own_stores(data, stores)
         files.append(PatchFiles("real", (train,), (check,)))
     elif data.wants_real:
         real = data_root(root)
-        files.append(PatchFiles("real", (real_store(folder, real, "train"),), (real_store(folder, real, "val"),)))
+        files.append(PatchFiles("real", (stores.real(real, "train"),), (stores.real(real, "val"),)))
     if data.rendered_scenes:
         # The first file validates; scenes of the others are trained on.
         scenes = [data.validation_scenes, *files_of(data.rendered_scenes)]
-        paths = rendered_stores(folder, scenes, processors(), lambda more: done(more, sum(scenes)))
+        paths = stores.rendered(scenes, processors(), lambda more: done(more, sum(scenes)))
         files.append(PatchFiles("rendered", tuple(paths[1:]), tuple(paths[:1])))
     return files
 

@@ -22,11 +22,10 @@ from lanestream.lanes import Candidate, Image
 class StripCutter:
     """Cuts patches, `at_once` of them at a time.
 
-    Images wider than `detail_width` are reduced to it first, or their near rows would alias.
+    Images wider than the geometry's `detail_width` are reduced to it first, or their near rows would alias.
     """
 
     geometry: StripGeometry = StripGeometry()
-    detail_width: int = 1280
     at_once: int = 6
 
     def cut(self, image: Image, candidates: Sequence[Candidate], view: RoadView) -> NDArray[np.uint8]:
@@ -37,7 +36,7 @@ class StripCutter:
         self, image: Image, candidates: Sequence[Candidate], view: RoadView
     ) -> tuple[Callable[[], NDArray[np.uint8]], ...]:
         """What cuts the patches, up to `at_once` of them each, in the order of `candidates`; at least one, of none."""
-        scaling = Scaling(min(1.0, self.detail_width / view.width))
+        scaling = Scaling(min(1.0, self.geometry.detail_width / view.width))
         detail = resized(image, scaling)
         detail_view = view.scaled(scaling, detail.shape[1], detail.shape[0])
         starts = range(0, max(len(candidates), 1), self.at_once)
