@@ -38,6 +38,11 @@ class Scaling:
         v, b, k = curve.coefficients
         return Curve(self.to_image(curve.horizon), (self.to_image(v), b, k / self.factor**2))
 
+    def covariance_to_image(self, covariance: FloatArray) -> FloatArray:
+        """The covariance (3, 3) of a working curve's coefficients, of those in image pixels."""
+        by = np.array([1.0 / self.factor, 1.0, 1.0 / self.factor**2])
+        return covariance * np.outer(by, by)
+
     def curve_to_working(self, curve: Curve) -> Curve:
         """An image curve, in working pixels."""
         v, b, k = curve.coefficients

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import ImageError, ImageTooLargeError
+from lanestream.geometry import Scaling
 from lanestream.image_files import Header, corrupt, read_body, read_header
 
 if TYPE_CHECKING:
@@ -22,6 +23,11 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
 
 import cv2  # noqa: E402  (the limit above has to stand first)
 import numpy as np  # noqa: E402
+
+# How OpenCV is told to decode an image whole, at a half, at a quarter and at an eighth of its size.
+_REDUCED: Final = {
+    1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,20 +43,65 @@ class ImageLimits:
     max_aspect: int = 5
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A decoded image: BGR pixels `image` (H, W, 3) uint8, upright; those of its file are `reduced` times as many."""
+
+    image: Image
+    reduced: int = 1
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in its file."""
+        return self.image.shape[1] * self.reduced, self.image.shape[0] * self.reduced
+
+    @property
+    def scaling(self) -> Scaling:
+        """From pixels of the file to those of `image`."""
+        return Scaling(1.0 / self.reduced)
+
+
 def decode(data: bytes, limits: ImageLimits) -> Image:
     """The image in `data`, a JPEG, PNG or WebP file, as BGR (H, W, 3) uint8, upright as its EXIF orientation says.
 
     Raises ImageTooLargeError beyond the limits, and ImageError where it is no image, too small, cut short or corrupt.
     """
+    header = _checked(data, limits)
+    return _decoded(data, header, 1)
+
+
+def decode_reduced(data: bytes, limits: ImageLimits, least_width: int) -> Picture:
+    """The image in `data` at a half, a quarter or an eighth of its size, as long as it is `least_width` pixels wide.
+
+    That costs less than to decode it and to reduce it then. Raises what `decode` raises.
+    """
+    header = _checked(data, limits)
+    reduced = max(by for by in _REDUCED if (header.width >= by * least_width and _divides(by, header)) or by == 1)
+    image = _decoded(data, header, reduced)
+    if image.shape[1] * reduced != header.width:  # turned by EXIF, and its height is not known to suffice
+        return Picture(_decoded(data, header, 1))
+    return Picture(image, reduced)
+
+
+def _divides(by: int, header: Header) -> bool:
+    return header.width % by == 0 and header.height % by == 0
+
+
+def _checked(data: bytes, limits: ImageLimits) -> Header:
     _check_bytes(len(data), limits)
     header = read_header(data)
     _check_size(header, limits)
+    return header
+
+
+def _decoded(data: bytes, header: Header, reduced: int) -> Image:
+    """The pixels of a checked image file, each side divided by `reduced`."""
     try:
-        image = cv2.imdecode(np.frombuffer(read_body(data, header), np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(read_body(data, header), np.uint8), _REDUCED[reduced])
     except cv2.error:
         image = None
     # A turn by EXIF swaps the sides; any other difference means that the limits were checked on another image.
-    if image is None or sorted(image.shape[:2]) != sorted((header.width, header.height)):
+    if image is None or sorted(image.shape[:2]) != sorted((header.width // reduced, header.height // reduced)):
         raise corrupt(header.kind)
     return np.asarray(image, np.uint8)
 

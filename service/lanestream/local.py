@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from lanestream.detection.edges import WORKING_WIDTH
 from lanestream.engine import chosen_regressor, load_engine
-from lanestream.imaging import MOST_PIXELS, ImageLimits, decode
+from lanestream.imaging import MOST_PIXELS, ImageLimits, Picture, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
 
 if TYPE_CHECKING:
@@ -66,10 +66,10 @@ class LocalCamera:
         Raises ImageError where the file can't be decoded; the session is then as it was before.
         """
         started = time.perf_counter()
-        pixels = decode(image, _LIMITS) if isinstance(image, bytes) else image
+        picture = decode_reduced(image, _LIMITS, WORKING_WIDTH) if isinstance(image, bytes) else Picture(image)
         decoded = time.perf_counter()
-        result = self._engine.process(self._session, pixels, timestamp)
+        result = self._engine.process(self._session, picture.image, timestamp)
         total = 1e3 * (time.perf_counter() - started)
         timing = {"decode": 1e3 * (decoded - started), "queue": 0.0, **result.timing_ms, "total": total}
-        frame = ProcessedFrame(pixels, replace(result, timing_ms=timing))
+        frame = ProcessedFrame.of(picture, result, timing)
         return lanes_message(frame, seq=seq, timestamp=timestamp, camera=self._model)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from lanestream.geometry import Camera
+from lanestream.geometry import Camera, Scaling
 from lanestream.protocol import (
     CameraModel,
     EgoModel,
@@ -22,7 +22,8 @@ from lanestream.protocol import (
 )
 
 if TYPE_CHECKING:
-    from lanestream.lanes import EgoLane, FloatArray, FrameResult, Image, LaneBoundary
+    from lanestream.imaging import Picture
+    from lanestream.lanes import EgoLane, FloatArray, FrameResult, LaneBoundary
 
 _POINTS: Final = 24
 # Decimals that keep a curve exact to a hundredth of a pixel over the tallest image that is accepted.
@@ -36,17 +37,25 @@ Ground = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ProcessedFrame:
-    """A frame at the end of its way: the decoded BGR image (H, W, 3) uint8 and its lanes, with all stages' timing."""
+    """A frame at the end of its way: its picture, and its lanes in pixels of its file, with all stages' timing."""
 
-    image: Image
+    picture: Picture
     result: FrameResult
+
+    @classmethod
+    def of(cls, picture: Picture, result: FrameResult, timing_ms: dict[str, float]) -> ProcessedFrame:
+        """From the `result` in pixels of the decoded image."""
+        scaling = picture.scaling
+        lanes = tuple(_in_image(lane, scaling) for lane in result.lanes)
+        horizon = scaling.to_image(result.horizon)
+        return cls(picture, replace(result, lanes=lanes, horizon=horizon, timing_ms=timing_ms))
 
 
 def lanes_message(
     frame: ProcessedFrame, *, seq: int, timestamp: float, dropped: int = 0, camera: CameraModel | None = None
 ) -> LanesMessage:
     """The message about `frame`; `timestamp` in seconds on the client's clock. With a `camera`, in metres too."""
-    height, width = frame.image.shape[:2]
+    width, height = frame.picture.size
     result = frame.result
     grounds = {} if camera is None else _grounds(result, Camera(camera.height, camera.field_of_view), width)
     return LanesMessage(
@@ -60,6 +69,16 @@ def lanes_message(
         events=[LaneChangeModel(track_id=event.track_id, direction=event.direction) for event in result.events],
         dropped=dropped,
         timing_ms=TimingModel(**{stage: round(ms, 3) for stage, ms in result.timing_ms.items()}),
+    )
+
+
+def _in_image(lane: LaneBoundary, scaling: Scaling) -> LaneBoundary:
+    return replace(
+        lane,
+        curve=scaling.curve_to_image(lane.curve),
+        covariance=scaling.covariance_to_image(lane.covariance),
+        top=scaling.to_image(lane.top),
+        bottom=scaling.to_image(lane.bottom),
     )
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from lanestream.errors import ImageError, ImageTooLargeError
 from lanestream.image_files import Header, read_header
-from lanestream.imaging import ImageLimits, decode
+from lanestream.imaging import ImageLimits, decode, decode_reduced
 
 LIMITS = ImageLimits()
 KINDS = {".jpg": "JPEG", ".png": "PNG", ".webp": "WebP"}
@@ -143,11 +143,43 @@ def test_a_jpeg_with_endless_scans_is_refused() -> None:
     assert "more than 100 scans" in refused(data[:-2] + 101 * scan + data[-2:])
 
 
-def test_pictures_are_turned_upright() -> None:
+def turned(data: bytes) -> bytes:
+    """A JPEG file with the note that its camera was held upright."""
     tags = b"Exif\x00\x00MM\x00*" + struct.pack(">IH", 8, 1) + struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0) + bytes(4)
-    data = fakes.image_file()
-    turned = data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(tags)) + tags + data[2:]
-    assert decode(turned, LIMITS).shape == (320, 180, 3)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(tags)) + tags + data[2:]
+
+
+def test_pictures_are_turned_upright() -> None:
+    assert decode(turned(fakes.image_file()), LIMITS).shape == (320, 180, 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("size", "reduced"),
+    [((1280, 720), 2), ((1278, 720), 1), ((2560, 1440), 4), ((1920, 1080), 2), ((1282, 721), 1), ((320, 180), 1)],
+)
+def test_large_images_are_reduced_where_their_sides_divide(kind: str, size: tuple[int, int], reduced: int) -> None:
+    picture = decode_reduced(fakes.image_file(kind, *size), LIMITS, 640)
+    assert (picture.size, picture.reduced) == (size, reduced)
+    assert picture.image.shape == (size[1] // reduced, size[0] // reduced, 3)
+
+
+def test_a_reduced_image_is_its_mean_and_a_turned_one_stays_whole() -> None:
+    import cv2
+
+    data = fakes.image_file(".jpg", 1280, 720)
+    halves = cv2.resize(decode(data, LIMITS), (640, 360), interpolation=cv2.INTER_AREA)
+    assert cv2.norm(decode_reduced(data, LIMITS, 640).image, halves, cv2.NORM_INF) <= 3
+    picture = decode_reduced(turned(data), LIMITS, 640)
+    assert (picture.size, picture.reduced) == ((720, 1280), 1)
+
+
+def test_reducing_refuses_what_decoding_refuses() -> None:
+    data = fakes.image_file(".jpg", 1280, 720)
+    with pytest.raises(ImageError, match="JPEG"):
+        decode_reduced(data[: len(data) // 2], LIMITS, 640)
+    with pytest.raises(ImageTooLargeError):
+        decode_reduced(data, ImageLimits(max_pixels=640 * 360), 640)
 
 
 def test_the_second_wall_stands_before_opencv_is_imported() -> None:

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanestream.lanes import Curve, EgoLane, FrameResult, LaneBoundary, LaneChange
+from lanestream.imaging import Picture
+from lanestream.lanes import Curve, EgoLane, FrameResult, LaneBoundary, LaneChange, curve_basis
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.protocol import LanesMessage, parse_server_message
 
@@ -21,7 +22,7 @@ def boundary(curve: Curve, top: float, bottom: float) -> LaneBoundary:
 
 def told(result: FrameResult) -> LanesMessage:
     result = FrameResult(result.lanes, result.ego, result.horizon, result.events, dict.fromkeys(STAGES, 1.23456))
-    frame = ProcessedFrame(np.zeros((2160, 3840, 3), np.uint8), result)
+    frame = ProcessedFrame(Picture(np.zeros((2160, 3840, 3), np.uint8)), result)
     message = parse_server_message(lanes_message(frame, seq=3, timestamp=0.12, dropped=2).model_dump_json())
     assert isinstance(message, LanesMessage)
     return message
@@ -42,6 +43,28 @@ def test_all_fields_are_told() -> None:
     assert lane_told.points[0] == lane_told.line.bottom
     assert lane_told.points[-1] == lane_told.line.top
     assert [y for _, y in lane_told.points] == sorted((y for _, y in lane_told.points), reverse=True)
+
+
+def test_lanes_of_a_reduced_picture_are_told_in_pixels_of_its_file() -> None:
+    lane = boundary(Curve(100.0, (300.0, -1.25, 500.0)), 120.0, 359.0)
+    result = FrameResult((lane,), EgoLane(5, None), 100.0)
+    picture = Picture(np.zeros((360, 640, 3), np.uint8), reduced=2)
+    frame = ProcessedFrame.of(picture, result, dict.fromkeys(STAGES, 1.0))
+    (moved,) = frame.result.lanes
+    assert (frame.picture.size, frame.result.horizon, moved.top, moved.bottom) == ((1280, 720), 200.5, 240.5, 718.5)
+    for row in (130.0, 200.0, 359.0):
+        assert moved.curve.x(2.0 * row + 0.5) == pytest.approx(2.0 * float(lane.curve.x(row)) + 0.5, abs=1e-9)
+        # What is known to a pixel of the reduced picture is known to two of the file.
+        before, after = (
+            float(basis @ covariance @ basis)
+            for basis, covariance in (
+                (curve_basis(100.0, np.array([row]))[0], lane.covariance),
+                (curve_basis(200.5, np.array([2.0 * row + 0.5]))[0], moved.covariance),
+            )
+        )
+        assert after == pytest.approx(4.0 * before)
+    message = lanes_message(frame, seq=0, timestamp=0.0)
+    assert (message.width, message.height, message.lanes[0].line.bottom[1]) == (1280, 720, 718.5)
 
 
 @given(

@@ -5,16 +5,16 @@
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import litserve
 import numpy as np
 
 from lanestream.detection import Question, Steps, in_one
+from lanestream.detection.edges import WORKING_WIDTH
 from lanestream.engine import load_engine
-from lanestream.imaging import ImageLimits, decode
-from lanestream.lanes import FrameResult, Image
+from lanestream.imaging import ImageLimits, Picture, decode_reduced
+from lanestream.lanes import FrameResult
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.runtime import Provider
 
@@ -34,17 +34,16 @@ class LaneApi(litserve.LitAPI):  # type: ignore[misc]
         """Loads and warms the networks, in the worker."""
         self._engine = load_engine(provider=self._provider)
 
-    def decode_request(self, request: litserve.Request) -> Image:
+    def decode_request(self, request: litserve.Request) -> Picture:
         """The picture of a form."""
-        return decode(request["image"].file.read(), ImageLimits())
+        return decode_reduced(request["image"].file.read(), ImageLimits(), WORKING_WIDTH)
 
-    def predict(self, images: Sequence[Image]) -> list[ProcessedFrame]:
+    def predict(self, pictures: Sequence[Picture]) -> list[ProcessedFrame]:
         """The lanes of a batch of images."""
+        frames = [self._engine.open_session().follow(picture.image, 0.0) for picture in pictures]
         return [
-            ProcessedFrame(image, replace(result, timing_ms=_NO_TIMING))
-            for image, result in zip(
-                images, in_step([self._engine.open_session().follow(image, 0.0) for image in images]), strict=True
-            )
+            ProcessedFrame.of(picture, result, _NO_TIMING)
+            for picture, result in zip(pictures, in_step(frames), strict=True)
         ]
 
     def encode_response(self, output: ProcessedFrame) -> dict[str, Any]:

@@ -145,7 +145,7 @@ async def detect(
     service.sessions.check_limits(caller)
     data = await service.bodies.image_file(request)
     with service.sessions.opened(loaded.engine, caller, horizon, detector) as opened:
-        frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic()))
+        frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic(), whole=form != _JSON))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
     if form == _JSON or service.draw is None:
         return Response(message.model_dump_json(), media_type=_JSON)
@@ -224,5 +224,5 @@ def _answer_form(request: Request, draw: Draw | None) -> str:
 
 
 def _picture(draw: Draw, frame: ProcessedFrame, message: LanesMessage, form: str) -> bytes:
-    _, encoded = cv2.imencode(_PICTURES[form], draw(frame.image, message))
+    _, encoded = cv2.imencode(_PICTURES[form], draw(frame.picture.image, message))
     return encoded.tobytes()

@@ -51,7 +51,7 @@ class Refinement:
     noise: float = 1.0
     blur: float = 0.012
     steps: tuple[float, ...] = (0.06, 0.05, 0.04, 0.03)
-    detail_width: int = 1280
+    detail_width: int = 640
 
     def refine(self, image: Image, candidates: Sequence[Candidate], view: RoadView) -> list[Fit]:
         """A fit for each candidate of a BGR image (H, W, 3)."""

@@ -11,14 +11,15 @@ import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 
 from lanestream.detection import NO_OUTPUTS
+from lanestream.detection.edges import WORKING_WIDTH
 from lanestream.errors import ExpiredError
-from lanestream.imaging import ImageLimits, decode
+from lanestream.imaging import ImageLimits, Picture, decode, decode_reduced
 from lanestream.inference.batcher import Answer, Batcher, BatchReport
 from lanestream.messages import ProcessedFrame
 from lanestream.sessions.walk import FrameWalk
@@ -34,13 +35,15 @@ T = TypeVar("T")
 class EncodedFrame:
     """An image file, when it was captured (the client's seconds) and when it came (monotonic seconds).
 
-    After `deadline` (monotonic seconds) nobody wants its lanes any more; None: always.
+    After `deadline` (monotonic seconds) nobody wants its lanes any more; None: always. Who wants to draw on it asks for
+    the `whole` picture; for finding lanes a reduced one does.
     """
 
     data: bytes
     timestamp: float
     arrived: float
     deadline: float | None = None
+    whole: bool = False
 
 
 class FrameRunner:
@@ -86,15 +89,20 @@ class FrameRunner:
         started = time.monotonic()
         if frame.deadline is not None and frame.deadline < started:
             raise ExpiredError("the frame waited too long", "send fewer frames a second")
-        image = decode(frame.data, self._limits)
+        picture = self._decoded(frame)
         decoded = time.monotonic()
-        walk = FrameWalk(session.follow(image, frame.timestamp))
+        walk = FrameWalk(session.follow(picture.image, frame.timestamp))
         inferring = self._answer_all(walk, frame.deadline)
         ended = time.monotonic()
         stages = {"decode": 1e3 * (decoded - started), "infer": 1e3 * inferring, **walk.timing_ms}
         total = 1e3 * (ended - frame.arrived)
         timing = {**stages, "queue": max(0.0, total - sum(stages.values())), "total": total}
-        return ProcessedFrame(image, replace(walk.result, timing_ms=timing))
+        return ProcessedFrame.of(picture, walk.result, timing)
+
+    def _decoded(self, frame: EncodedFrame) -> Picture:
+        if frame.whole:
+            return Picture(decode(frame.data, self._limits))
+        return decode_reduced(frame.data, self._limits, WORKING_WIDTH)
 
     def _answer_all(self, walk: FrameWalk, deadline: float | None) -> float:
         """Goes through all questions of a frame; the seconds for which the networks kept it waiting."""
