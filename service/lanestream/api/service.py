@@ -64,18 +64,8 @@ class Service:
 
     @property
     def limits(self) -> Limits:
-        """What clients are told of the limits."""
-        settings = self.settings
-        return Limits(
-            max_bytes=settings.max_bytes,
-            max_pixels=settings.max_pixels,
-            credits=settings.credits,
-            frames_per_s=settings.frames_per_s,
-            bytes_per_s=settings.bytes_per_s,
-            idle_s=settings.idle_s,
-            session_s=settings.session_s,
-            resume_s=settings.resume_s,
-        )
+        """What clients are told of the limits, each by the name of its setting."""
+        return Limits.model_validate(self.settings, from_attributes=True)
 
     def check_open(self) -> None:
         """Raises NotReadyError before there is an engine, and DrainingError where nothing new is taken any more."""
