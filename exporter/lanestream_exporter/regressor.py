@@ -17,7 +17,7 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lanestream.detection.regression import ANCHORS
-from lanestream_exporter.alexnet import FULL, AlexNet
+from lanestream_exporter.alexnet import FULL, AlexNet, Shape
 from lanestream_exporter.canvases import SHARES
 
 # Standard deviations are told as logarithms in image widths, within what pixels and roads allow.
@@ -34,16 +34,17 @@ class LaneRegressor(nn.Module):
     columns are all of one size, which a network learns more easily.
     """
 
-    def __init__(self, normalised: bool = True, dropout: float = 0.1) -> None:
+    def __init__(self, size: Shape = FULL, *, normalised: bool = True, dropout: float = 0.1) -> None:
         super().__init__()
-        trunk = AlexNet(normalised=normalised)
+        self.size = size
+        trunk = AlexNet(shape=size, normalised=normalised)
         self.features, self.norms = trunk.features, trunk.norms
-        self.hidden = nn.Sequential(nn.Dropout(dropout), *_linear(FULL.features, FULL.hidden, normalised), nn.ReLU())
-        self.shape = nn.Sequential(*_linear(FULL.hidden, 16, normalised), nn.ReLU(), nn.Linear(16, 6))
-        self.doubts = nn.Linear(FULL.hidden, 9)
+        self.hidden = nn.Sequential(nn.Dropout(dropout), *_linear(size.features, size.hidden, normalised), nn.ReLU())
+        self.shape = nn.Sequential(*_linear(size.hidden, 16, normalised), nn.ReLU(), nn.Linear(16, 6))
+        self.doubts = nn.Linear(size.hidden, 9)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Raw outputs (N, 15) of normalised canvases (N, 3, 224, 224).
+        """Raw outputs (N, 15) of normalised canvases (N, 3, size, size).
 
         Columns at the anchors in image widths from their usual ones, logarithms of their standard deviations, logits of
         presence, the horizon's distance in depths.
@@ -57,8 +58,8 @@ class LaneRegressor(nn.Module):
 
     def folded(self) -> LaneRegressor:
         """The same function without normalisation layers: each goes into the convolution before it."""
-        plain = LaneRegressor(normalised=False)
-        trunk = AlexNet(normalised=True)
+        plain = LaneRegressor(self.size, normalised=False)
+        trunk = AlexNet(shape=self.size)
         trunk.features, trunk.norms = self.features, self.norms
         plain.features = trunk.folded().features
         plain.hidden[1] = _fused(self.hidden[1], self.hidden[2])

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from lanestream.engine import load_engine
 from lanestream.errors import ExportError, ModelError
+from lanestream.geometry import StripGeometry
 from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
 from lanestream.inference.model_info import METADATA_KEY
-from lanestream_exporter.alexnet import AlexNet, normalise
+from lanestream_exporter.alexnet import AlexNet, Shape, normalise
 from lanestream_exporter.exporting import export
 from lanestream_exporter.exporting.calibration import Calibration
 from lanestream_exporter.exporting.classifier import ClassifierSubject
@@ -57,16 +58,22 @@ def exported(subject: Subject, precision: Precision, folder: Path) -> Exported:
 @pytest.fixture(scope="module")
 def classifier(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     torch.manual_seed(0)
-    network = AlexNet(normalised=False).eval()
-    with torch.no_grad():  # a fresh AlexNet answers every patch alike
-        network.classifier[6].weight.mul_(4000.0)  # type: ignore[operator, union-attr]
-    return exported(ClassifierSubject(network), "int8", tmp_path_factory.mktemp("classifier"))
+    network = AlexNet(shape=Shape(112, 0.5, 512), normalised=False).eval()
+    subject = ClassifierSubject(network, strip=StripGeometry(112))
+    # A fresh AlexNet answers every patch alike: its small differences are made large, about their mean.
+    logits = in_batches(lambda part: network(normalise(part)), subject.ranging(SOURCE))
+    last = network.classifier[6]
+    assert isinstance(last, torch.nn.Linear)
+    with torch.no_grad():
+        last.weight /= logits.std(dim=0)[:, None]
+        last.bias.copy_((last.bias - logits.mean(dim=0)) / logits.std(dim=0))
+    return exported(subject, "int8", tmp_path_factory.mktemp("classifier"))
 
 
 @pytest.fixture(scope="module")
 def regressor(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     torch.manual_seed(0)
-    network = LaneRegressor().eval().folded()
+    network = LaneRegressor(Shape(160, 0.5, 256)).eval().folded()
     return exported(RegressorSubject(network), "fp32", tmp_path_factory.mktemp("regressor"))
 
 
@@ -146,7 +153,7 @@ def test_both_files_are_served_by_their_detectors(classifier: Exported, regresso
 def test_the_files_describe_themselves(classifier: Exported, regressor: Exported) -> None:
     info = OnnxModel.load(classifier.path, "cpu").info
     assert isinstance(info, ClassifierInfo)
-    assert (info.precision, info.classes, info.strip.size) == ("int8", ("false", "lane"), 224)
+    assert (info.precision, info.classes, info.strip.size) == ("int8", ("false", "lane"), 112)
     assert info.training == {
         "data": "none", "step": 7, "rank_energy": 0.9, "export_frames": "rendered scenes", "normalisation": "contrast",
     }  # fmt: skip
@@ -155,14 +162,14 @@ def test_the_files_describe_themselves(classifier: Exported, regressor: Exported
     assert info.threshold == classifier.report.subject.calibration.threshold
     other = OnnxModel.load(regressor.path, "cpu").info
     assert isinstance(other, RegressorInfo)
-    assert (other.canvas.size, other.canvas.detail_width, other.precision) == (224, 448, "fp32")
+    assert (other.canvas.size, other.canvas.detail_width, other.precision) == (160, 448, "fp32")
     assert "onnxruntime" in other.exporter
 
 
 def test_half_precision_loads_on_the_cpu_and_agrees(classifier: Exported, tmp_path: Path) -> None:
     subject = classifier.report.subject
     path = tmp_path / "fp16.onnx"
-    write_graph(subject.served(half=True), path, subject.input_name, subject.output_name)
+    write_graph(subject.served(half=True), classifier.check.inputs, path, (subject.input_name, subject.output_name))
     describe(path, subject.info(Description("half", "fp16", {}, {})))
     graph = onnx.load(str(path)).graph
     weights = [tensor for tensor in graph.initializer if tensor.name.endswith("weight")]
@@ -184,9 +191,10 @@ def test_a_file_that_differs_is_not_written(
     assert not list(tmp_path.iterdir())
 
 
-def _other_network(_: Any, path: Path, input_name: str, output_name: str) -> None:
+def _other_network(_: Any, example: NDArray[np.uint8], path: Path, names: tuple[str, str]) -> None:
     """Writes a file that answers every patch with certainty."""
     helper = onnx.helper
+    input_name, output_name = names
     shape = helper.make_node("Shape", [input_name], ["shape"], start=0, end=1)
     two = helper.make_node("Constant", [], ["two"], value_ints=[2])
     both = helper.make_node("Concat", ["shape", "two"], ["size"], axis=0)
@@ -194,7 +202,7 @@ def _other_network(_: Any, path: Path, input_name: str, output_name: str) -> Non
     graph = helper.make_graph(
         [shape, two, both, ones],
         "certain",
-        [helper.make_tensor_value_info(input_name, onnx.TensorProto.UINT8, ["N", 224, 224, 3])],
+        [helper.make_tensor_value_info(input_name, onnx.TensorProto.UINT8, ["N", *example.shape[1:]])],
         [helper.make_tensor_value_info(output_name, onnx.TensorProto.FLOAT, ["N", 2])],
     )
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), str(path))

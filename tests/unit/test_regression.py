@@ -15,6 +15,7 @@ from lanestream.detection.prior import RoadGlance
 from lanestream.detection.regression import ANCHORS, OUTPUTS, RegressionDetector, RoadReading
 from lanestream.geometry import CanvasGeometry, RoadView
 from lanestream.lanes import Curve, Image
+from lanestream_exporter.alexnet import Shape
 from lanestream_exporter.canvases import SHARES, Warp, plain_warp, sample
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss, logs_at_shares
@@ -219,7 +220,7 @@ def test_deviations_are_interpolated_between_the_anchors() -> None:
 
 def test_folding_leaves_the_same_function() -> None:
     torch.manual_seed(0)
-    network = LaneRegressor()
+    network = LaneRegressor(Shape(112, 0.5, 64))
     for norm in (
         module for module in network.modules() if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d)
     ):
@@ -227,7 +228,7 @@ def test_folding_leaves_the_same_function() -> None:
         torch.nn.init.uniform_(norm.running_var, 0.5, 1.5)  # type: ignore[arg-type]
         torch.nn.init.normal_(norm.running_mean)  # type: ignore[arg-type]
     network.eval()
-    canvases = torch.randn(2, 3, 224, 224)
+    canvases = torch.randn(2, 3, 112, 112)
     with torch.inference_mode():
         plain = network.folded()
         assert not [

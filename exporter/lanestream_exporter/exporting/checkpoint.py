@@ -56,12 +56,12 @@ def read_subject(path: Path, foreign: Foreign | None = None) -> tuple[Subject, d
 
 def _own(path: Path, state: Mapping[str, Any]) -> Subject:
     weights = state["network"]
-    if "shape.0.weight" in weights:
-        regressor = LaneRegressor(normalised=_has_norms(weights))
-        _load(path, regressor, weights)
-        return RegressorSubject(regressor.eval().folded())
     config = (state.get("record") or {}).get("config") or {}
     shape = Shape(**config["network"]) if "network" in config else FULL
+    if "shape.0.weight" in weights:
+        regressor = LaneRegressor(shape, normalised=_has_norms(weights))
+        _load(path, regressor, weights)
+        return RegressorSubject(regressor.eval().folded())
     return ClassifierSubject(_alexnet(path, weights, shape), strip=StripGeometry(shape.size))
 
 

@@ -14,6 +14,7 @@ from scipy.special import logit
 from torch import Tensor, nn
 
 from lanestream.detection.regression import RegressionDetector
+from lanestream.geometry import CanvasGeometry
 from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import CanvasInfo, RegressorInfo
 from lanestream.lanes import FloatArray
@@ -71,7 +72,7 @@ class RegressorSubject:
     @property
     def detector(self) -> RegressionDetector:
         """The detector that will ask the file."""
-        return RegressionDetector(self.calibration.threshold)
+        return RegressionDetector(self.calibration.threshold, CanvasGeometry(self.network.size.size))
 
     def ranging(self, source: FrameSource) -> NDArray[np.uint8]:
         """Canvases (N, size, size, 3) of training frames, as they are and as other cameras would see them."""

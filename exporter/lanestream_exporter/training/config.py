@@ -88,7 +88,7 @@ class Frames(Section):
 
 
 class NetworkSize(Section):
-    """How large the classifier is, as `alexnet.Shape` tells; its patches are of the same `size`."""
+    """How large the network is, as `alexnet.Shape` tells; the pictures that it is shown are of the same `size`."""
 
     size: Annotated[int, Field(ge=63)] = 112
     width: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5

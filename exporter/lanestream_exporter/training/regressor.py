@@ -19,7 +19,7 @@ from lanestream_exporter.augment import photographed
 from lanestream_exporter.canvases import SHARES, Target, Warp, plain_warp, sample
 from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss
 from lanestream_exporter.roadframes import RoadFrame
-from lanestream_exporter.training.config import Light, PatchData, Share, TrainConfig
+from lanestream_exporter.training.config import Light, NetworkSize, PatchData, Share, TrainConfig
 from lanestream_exporter.training.loop import CHOOSES, Batch
 
 # The shares of the depth whose lateral errors are told: about 10 m and 30 m ahead of a usual dash camera.
@@ -40,6 +40,7 @@ class RegressorConfig(TrainConfig):
     batch: int = Field(default=64, ge=2)
     ema: float = Field(default=0.998, ge=0.0, lt=1.0)
     clip: float = Field(default=5.0, ge=0.0)
+    network: NetworkSize = NetworkSize(size=224, width=0.5, hidden=1024)
     data: FrameData = FrameData()
     light: Light = Light()
 
@@ -65,7 +66,7 @@ class RegressorTask:
     ) -> None:
         self._config = config
         self._sources = {source.name: source for source in sources}
-        self._geometry = CanvasGeometry()
+        self._geometry = CanvasGeometry(config.network.size)
         self._checks = {source.name: self._plain(source.check) for source in sources}
         self.network = network
         counts = {s.name: {"train": len(s.train), "check": len(s.check)} for s in sources}
@@ -132,7 +133,7 @@ def starting_regressor(config: RegressorConfig) -> LaneRegressor:
     `initial` is the checkpoint of a regressor's or of a classifier's run. Raises CheckpointError where it is neither.
     """
     torch.manual_seed(config.seed)
-    network = LaneRegressor()
+    network = LaneRegressor(config.network.shape)
     if config.initial is None:
         return network
     state = load_state(Path(config.initial)).get("network")
