@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from lanestream.geometry import Camera, Scaling
+from lanestream.lanes import curve_columns
 from lanestream.protocol import (
     CameraModel,
     EgoModel,
@@ -22,6 +23,8 @@ from lanestream.protocol import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lanestream.imaging import Picture
     from lanestream.lanes import EgoLane, FloatArray, FrameResult, LaneBoundary
 
@@ -64,7 +67,10 @@ def lanes_message(
         width=width,
         height=height,
         horizon=round(result.horizon, 2),
-        lanes=[_lane(lane, grounds.get(lane.track_id)) for lane in result.lanes],
+        lanes=[
+            _lane(lane, points, grounds.get(lane.track_id))
+            for lane, points in zip(result.lanes, _points(result.lanes), strict=True)
+        ],
         ego=_ego(result.ego, grounds),
         events=[LaneChangeModel(track_id=event.track_id, direction=event.direction) for event in result.events],
         dropped=dropped,
@@ -87,8 +93,7 @@ def _grounds(result: FrameResult, camera: Camera, width: int) -> dict[int, Groun
     return {lane.track_id: camera.ground(lane.curve, width) for lane in result.lanes}
 
 
-def _lane(lane: LaneBoundary, ground: Ground | None) -> LaneModel:
-    points = _points(lane)
+def _lane(lane: LaneBoundary, points: list[Point], ground: Ground | None) -> LaneModel:
     return LaneModel(
         track_id=lane.track_id,
         position=lane.position,
@@ -109,11 +114,13 @@ def _rounded(values: Ground, decimals: tuple[int, int, int]) -> Ground:
     return a, b, c
 
 
-def _points(lane: LaneBoundary) -> list[Point]:
+def _points(lanes: Sequence[LaneBoundary]) -> list[list[Point]]:
+    """The points of each lane, from its lowest row to its highest."""
+    ends = np.array([(lane.bottom, lane.top) for lane in lanes]).reshape(-1, 2)
     # Rounded rows first, so that the points are on the curve.
-    rows = np.linspace(lane.bottom, lane.top, _POINTS).round(2)
-    columns = lane.curve.x(rows)
-    return [(round(float(x), 2), float(y)) for x, y in zip(columns, rows, strict=True)]
+    rows = np.linspace(ends[:, 0], ends[:, 1], _POINTS, axis=1).round(2)
+    columns = curve_columns([lane.curve for lane in lanes], rows).round(2)
+    return [[(x, y) for x, y in lane] for lane in np.stack([columns, rows], axis=-1).tolist()]
 
 
 def _significant(matrix: FloatArray) -> list[list[float]]:
