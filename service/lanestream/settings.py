@@ -85,8 +85,11 @@ class Settings(BaseSettings):
         default=None, description="ONNX file of the second network, or `none`; the shipped one where absent."
     )
     provider: Provider = Field(default="auto", description="Where the networks run.")
-    inference_threads: int | None = Field(
-        default=None, ge=1, le=256, description="Threads of one network's run on the CPU; one a processor where absent."
+    inference_threads: int = Field(
+        default_factory=lambda: max(1, processors() // 2),
+        ge=1,
+        le=256,
+        description="Threads of one network's run on the CPU, by default for half of the processors.",
     )
     tensorrt_cache: Path | None = Field(default=None, description="Folder where TensorRT keeps the engines it builds.")
     max_bytes: int = Field(default=8 << 20, ge=1024, le=1 << 28, description="Bytes of one image file at most.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import fakes
 import numpy as np
@@ -17,16 +18,30 @@ from lanestream.inference.batcher import Batcher, BatchQueue, BatchReport, Waiti
 
 
 class Sums(fakes.FakeNetwork):
-    """Answers each input with the sum of its pixels; fails at a batch with an input of 255; remembers its batches."""
+    """Answers each input with the sum of its pixels; fails at a batch with an input of 255; remembers its batches.
+
+    `threads` are those that they ran in, and `together` is how many ran at once at most.
+    """
 
     def __init__(self) -> None:
         self.batches: list[int] = []
+        self.threads: list[str] = []
         self.may_run = threading.Event()
         self.may_run.set()
+        self.together = self._running = 0
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
-        assert self.may_run.wait(fakes.WAIT_S)
+        self._running += 1
+        self.together = max(self.together, self._running)
+        try:
+            assert self.may_run.wait(fakes.WAIT_S)
+            return self._sums(inputs)
+        finally:
+            self._running -= 1
+
+    def _sums(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.batches.append(len(inputs))
+        self.threads.append(threading.current_thread().name)
         if len(inputs) and inputs.max() == 255:
             raise RuntimeError("poison")
         return inputs.reshape(len(inputs), 1).astype(np.float32)
@@ -107,6 +122,39 @@ def test_each_gets_the_rows_it_asked_for() -> None:
     assert sum(report.questions for report in reports) == 4
     assert sum(report.rows for report in reports) == 4
     assert sum(network.batches) == 4
+
+
+def test_who_waits_runs_an_idle_network_itself() -> None:
+    reports: list[BatchReport] = []
+    network, batcher = Sums(), Batcher(reports.append)
+    assert batcher.answer(question(network, 1, 2)).outputs.ravel().tolist() == [1, 2]
+    with pytest.raises(RuntimeError, match="poison"):
+        batcher.answer(question(network, 255))
+    with pytest.raises(ExpiredError):
+        batcher.answer(question(network, 3), deadline=0.0)
+    assert network.batches == [2, 1]
+    assert set(network.threads) == {threading.current_thread().name}
+    assert batcher.ask(question(network, 9)).result(fakes.WAIT_S).outputs.tolist() == [[9]], "the thread works too"
+    batcher.close()
+    assert [report.rows for report in reports] == [2, 1]
+    with pytest.raises(RuntimeError, match="closed"):
+        batcher.answer(question(network, 1))
+
+
+def test_one_run_at_a_time_whoever_does_it() -> None:
+    network, batcher = Sums(), Batcher()
+    network.may_run.clear()
+    with ThreadPoolExecutor(4) as askers:
+        answers = [askers.submit(batcher.answer, question(network, value)) for value in range(4)]
+        asked = [batcher.ask(question(network, value)) for value in range(4, 6)]
+        assert not any(each.done() for each in answers)
+        network.may_run.set()
+        found = [each.result(fakes.WAIT_S).outputs.item() for each in answers]
+    assert found == [0, 1, 2, 3]
+    assert [each.result(fakes.WAIT_S).outputs.item() for each in asked] == [4, 5]
+    batcher.close()
+    assert network.together == 1
+    assert sum(network.batches) == 6
 
 
 def test_a_poisoned_question_fails_alone() -> None:

@@ -1,4 +1,4 @@
-"""Questions of many cameras, answered together: one thread runs the networks, each run takes what waits.
+"""Questions of many cameras, answered together: one run at a time, each run takes what waits.
 
 The rule is work-conserving: when the device is free it takes what is there, up to the network's largest batch, and
 never waits for more, so that a lone camera pays nothing for the company it doesn't have. A camera has one question at a
@@ -96,15 +96,28 @@ class BatchQueue:
         return batch, expired
 
 
+@dataclass(frozen=True)
+class Turn:
+    """What one run is to answer, what has expired before it, and how many questions still wait."""
+
+    batch: list[Waiting]
+    expired: list[Waiting]
+    still_waiting: int
+
+
 class Batcher:
-    """Answers questions in one thread of its own. `observe` is told of every run, in that thread."""
+    """Answers questions, in a thread of its own or in that of who waits. `observe` is told of every run, where it was.
+
+    It does not matter to a network which thread runs it, as long as it is one at a time.
+    """
 
     def __init__(self, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._observe = observe
         self._queue = BatchQueue()
         self._changed = threading.Condition()
+        self._running = False
         self._closed = False
-        self._thread = threading.Thread(target=self._run, name="lanestream-inference", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="lanestream-inference", daemon=True)
         self._thread.start()
 
     def ask(self, question: Question, deadline: float | None = None) -> Future[Answer]:
@@ -112,13 +125,23 @@ class Batcher:
 
         Raises RuntimeError after `close`.
         """
-        waiting = Waiting(question, time.monotonic(), deadline)
         with self._changed:
-            if self._closed:
-                raise RuntimeError("the batcher is closed")
-            self._queue.add(waiting)
-            self._changed.notify()
+            waiting = self._add(question, deadline)
+            if not self._running:
+                self._changed.notify()
         return waiting.answer
+
+    def answer(self, question: Question, deadline: float | None = None) -> Answer:
+        """The answer, for those who can do nothing without it: where nothing runs, they run what waits themselves.
+
+        To wake another thread for it, and to be woken by that one, takes longer. Raises what `ask` says.
+        """
+        with self._changed:
+            waiting = self._add(question, deadline)
+            turn = None if self._running else self._take()
+        if turn is not None:
+            self._run(turn)
+        return waiting.answer.result()
 
     def close(self) -> None:
         """Ends the thread after all that waits has been answered."""
@@ -127,20 +150,41 @@ class Batcher:
             self._changed.notify()
         self._thread.join()
 
-    def _run(self) -> None:
+    def _add(self, question: Question, deadline: float | None) -> Waiting:
+        if self._closed:
+            raise RuntimeError("the batcher is closed")
+        waiting = Waiting(question, time.monotonic(), deadline)
+        self._queue.add(waiting)
+        return waiting
+
+    def _work(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or len(self._queue) > 0)
+                self._changed.wait_for(lambda: not self._running and (self._closed or len(self._queue) > 0))
                 if not len(self._queue):
                     return
-                batch, expired = self._queue.take(time.monotonic())
-                still_waiting = len(self._queue)
-            for waiting in expired:
+                turn = self._take()
+            self._run(turn)
+
+    def _take(self) -> Turn:
+        """The next run, which is the caller's to do."""
+        self._running = True
+        batch, expired = self._queue.take(time.monotonic())
+        return Turn(batch, expired, len(self._queue))
+
+    def _run(self, turn: Turn) -> None:
+        try:
+            for waiting in turn.expired:
                 _fail(waiting, ExpiredError("the frame waited too long", "send fewer frames a second"))
             # A caller that went away took its question with it; one whose run begins can't any more.
-            wanted = [waiting for waiting in batch if waiting.answer.set_running_or_notify_cancel()]
+            wanted = [waiting for waiting in turn.batch if waiting.answer.set_running_or_notify_cancel()]
             if wanted:
-                self._answer(wanted, still_waiting)
+                self._answer(wanted, turn.still_waiting)
+        finally:
+            with self._changed:
+                self._running = False
+                if self._closed or len(self._queue):
+                    self._changed.notify()
 
     def _answer(self, batch: list[Waiting], still_waiting: int) -> None:
         started = time.monotonic()

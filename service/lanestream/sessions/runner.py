@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 
-from lanestream.detection import NO_OUTPUTS
+from lanestream.detection import NO_OUTPUTS, in_one
 from lanestream.detection.edges import WORKING_WIDTH
 from lanestream.errors import ExpiredError
 from lanestream.imaging import ImageLimits, Picture, decode, decode_reduced
@@ -49,16 +49,19 @@ class EncodedFrame:
 class FrameRunner:
     """Takes encoded frames to their lanes; the frames of one session one at a time, those of different ones at once.
 
-    `threads` frames are in work at a time, a thread each: enough to keep the processors and the networks busy. The
-    others wait for their turn before anything is spent on them, so that however many there are, a frame that is begun
-    is soon done. Frames that are wanted fresh leave one thread alone: the last bit of throughput would cost them more
-    time than it is worth. `observe` is told of every batch that the networks run.
+    `threads` frames are in work at a time, a thread each: enough to keep the processors and the networks busy. One more
+    is handed over beforehand, so that a thread that is done goes on without waiting for the event loop. The others wait
+    for their turn before anything is spent on them, so that however many there are, a frame that is begun is soon done.
+    Frames that are wanted fresh leave one thread alone: the last bit of throughput would cost them more time than it is
+    worth. `observe` is told of every batch that the networks run.
     """
 
     def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._limits = limits
-        self._turns = asyncio.Semaphore(threads)
+        self._turns = asyncio.Semaphore(threads + 1)
         self._fresh_turns = asyncio.Semaphore(max(1, threads - 1))
+        self._frames = 0
+        self._crowd = threads // 2 + 1
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
         self._batcher = Batcher(observe)
 
@@ -74,7 +77,11 @@ class FrameRunner:
         Raises ImageError where the file is refused, ExpiredError where its deadline passes before the networks ran; the
         session is then as it was before.
         """
-        return await self.work(self._process, session, frame)
+        self._frames += 1
+        try:
+            return await self.work(self._process, session, frame)
+        finally:
+            self._frames -= 1
 
     async def work(self, step: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """What `step` returns, run in a thread of the pool."""
@@ -91,7 +98,10 @@ class FrameRunner:
             raise ExpiredError("the frame waited too long", "send fewer frames a second")
         picture = self._decoded(frame)
         decoded = time.monotonic()
-        walk = FrameWalk(session.follow(picture.image, frame.timestamp))
+        steps = session.follow(picture.image, frame.timestamp)
+        # Frames of others keep the processors busy while a network is at this one; a frame among few is done sooner
+        # where its own work goes on meanwhile, at the price of more and smaller batches.
+        walk = FrameWalk(in_one(steps) if self._frames >= self._crowd else steps)
         inferring = self._answer_all(walk, frame.deadline)
         ended = time.monotonic()
         stages = {"decode": 1e3 * (decoded - started), "infer": 1e3 * inferring, **walk.timing_ms}
@@ -110,17 +120,18 @@ class FrameRunner:
         asked: list[Future[Answer]] = []
         question = walk.go()
         while question is not None:
-            # Who only collects what was asked before asks nothing.
-            if len(question.inputs) or not asked:
-                asked.append(self._batcher.ask(question, deadline))
             outputs = NO_OUTPUTS
             if question.waits:
                 since = time.monotonic()
-                answers = [each.result() for each in asked]
+                # Who only collects what was asked before asks nothing.
+                last = [self._batcher.answer(question, deadline)] if len(question.inputs) or not asked else []
+                answers = [*(each.result() for each in asked), *last]
                 for answer in answers:
                     # While the frame was at work itself, and while others had their turn, it was not the networks.
                     inferring += max(0.0, answer.ended - max(answer.started, since))
                     since = max(since, answer.ended)
                 outputs, asked = np.concatenate([answer.outputs for answer in answers]), []
+            else:
+                asked.append(self._batcher.ask(question, deadline))
             question = walk.go(outputs)
         return inferring
