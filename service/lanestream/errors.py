@@ -81,6 +81,9 @@ class ExpiredError(LanestreamError):
 
     code = "expired"
 
+    def __init__(self) -> None:
+        super().__init__("the frame waited too long", "the service is busy: send it again, or fewer frames a second")
+
 
 class BusyError(LanestreamError):
     """The service, or one caller, is at the session limit."""

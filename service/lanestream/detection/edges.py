@@ -42,14 +42,13 @@ def resized(image: Image, scaling: Scaling) -> Image:
     if scaling.factor == 1.0:
         return image
     width, height = (max(1, round(side * scaling.factor)) for side in image.shape[1::-1])
-    how = cv2.INTER_AREA if scaling.factor < 1.0 else cv2.INTER_LINEAR
-    # Halving is cheap, and of a halved image the rest of the way is too: averages over other areas are not.
+    # Halving is cheap, and what is left of the way then needs no averages over areas, which are not.
     while image.shape[1] >= 2 * width and image.shape[0] >= 2 * height and not (image.shape[1] | image.shape[0]) & 1:
         halves = image.shape[1] // 2, image.shape[0] // 2
         image = np.asarray(cv2.resize(image, halves, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        how = cv2.INTER_LINEAR
     if image.shape[1::-1] == (width, height):
         return image
+    how = cv2.INTER_AREA if image.shape[1] >= 2 * width else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, (width, height), interpolation=how), dtype=np.uint8)
 
 

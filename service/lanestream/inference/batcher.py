@@ -175,7 +175,7 @@ class Batcher:
     def _run(self, turn: Turn) -> None:
         try:
             for waiting in turn.expired:
-                _fail(waiting, ExpiredError("the frame waited too long", "send fewer frames a second"))
+                _fail(waiting, ExpiredError())
             # A caller that went away took its question with it; one whose run begins can't any more.
             wanted = [waiting for waiting in turn.batch if waiting.answer.set_running_or_notify_cancel()]
             if wanted:

@@ -95,7 +95,7 @@ class FrameRunner:
     def _process(self, session: Session, frame: EncodedFrame) -> ProcessedFrame:
         started = time.monotonic()
         if frame.deadline is not None and frame.deadline < started:
-            raise ExpiredError("the frame waited too long", "send fewer frames a second")
+            raise ExpiredError()
         picture = self._decoded(frame)
         decoded = time.monotonic()
         steps = session.follow(picture.image, frame.timestamp)
