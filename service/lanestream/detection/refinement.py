@@ -1,8 +1,8 @@
 """Sub-pixel refinement: a candidate's curve moved onto the paint beneath it, with what the fit is worth.
 
 The strip along the candidate is searched for a narrow bright bar row by row, and the curve is pulled onto the bars by
-reweighted least squares. Where the paint is missing, or shows no bend, the candidate's own line is the prior, so a
-straight marking stays straight and a dashed one keeps its direction.
+reweighted least squares. Where the paint is missing, or shows no bend, the candidate's own line is the prior, and so is
+the road that it shares with the others: a dashed marking keeps its direction, and far ends meet at one point.
 """
 
 from __future__ import annotations
@@ -15,12 +15,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.detection.commonroad import Boundaries, CommonRoad
 from lanestream.detection.edges import paint_grey, resized
-from lanestream.geometry import RoadView, Scaling
+from lanestream.geometry import RoadView, Scaling, visible_spans
 from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis, curve_columns, curves_through
 
 # hypot(1, slope) of an ego boundary: half a lane of 3.6 m beside a camera 1.45 m high.
 USUAL_LEANING: Final = 1.6
+
+# A strip's best bars are those of the best tenth of its rows.
+_BEST_ROWS: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -35,35 +39,44 @@ class Fit:
 class Refinement:
     """The fit's settings; all widths are shares of the rows below the horizon, as everything on the road is.
 
-    The strip reaches `reach` to either side in `cells` cells on `rows` rows; markings are about as wide as one of
-    `bars`. The curve is told by its columns at the depths `anchors`, where the candidate may be off by about `doubt`. A
-    bar's centre on one row is good to `noise` pixels of a 640 pixel wide image plus `blur` of the rows below the
-    horizon. Leaning candidates err more from side to side for the same distance across: for them `reach`, `doubt` and
-    `steps`, the distances at which bars lose half their weight, are wider.
+    The strip reaches `reach` to either side in `cells` cells on `rows` rows, from the bottom up to `top_share` of the
+    depth; markings are about as wide as one of `bars`, and a bar is weighed against `fair` times the strip's best ones.
+    The curve is told by its columns at the depths `anchors`, where the candidate may be off by about `doubt`. A bar's
+    centre on one row is good to `noise` pixels of a 640 pixel wide image plus `blur` of the rows below the horizon.
+    Leaning candidates err more from side to side for the same distance across: for them `reach`, `doubt` and `steps`,
+    the distances at which bars lose half their weight, are wider. All candidates are held to one `road`.
     """
 
     reach: float = 0.16
     cells: int = 97
-    rows: int = 64
+    rows: int = 48
+    top_share: float = 0.06
     bars: tuple[float, ...] = (0.05, 0.1, 0.17)
+    fair: float = 0.4
     anchors: tuple[float, float, float] = (1.0, 0.45, 0.15)
-    doubt: tuple[float, float, float] = (0.03, 0.02, 0.015)
+    doubt: tuple[float, float, float] = (0.03, 0.02, 0.1)
     noise: float = 1.0
     blur: float = 0.012
-    steps: tuple[float, ...] = (0.06, 0.05, 0.04, 0.03)
+    steps: tuple[float, ...] = (0.06, 0.045, 0.03)
+    road: CommonRoad = CommonRoad()
     detail_width: int = 640
 
     def refine(self, image: Image, candidates: Sequence[Candidate], view: RoadView) -> list[Fit]:
         """A fit for each candidate of a BGR image (H, W, 3)."""
         if not candidates:
             return []
-        along = _Along.of(candidates, view, self.rows)
+        curves = [candidate.curve for candidate in candidates]
+        spans = [
+            span or (candidate.top, candidate.bottom)
+            for span, candidate in zip(visible_spans(curves, view, self.top_share), candidates, strict=True)
+        ]
+        along = _Along.of(curves, spans, view, self.rows)
         strips = self._strips(image, along, view)
         bars = [self._bars(strip, leaning) for strip, leaning in zip(strips, along.leaning, strict=True)]
         return self._fits(along, np.stack(bars), view)
 
     def _strips(self, image: Image, along: _Along, view: RoadView) -> NDArray[np.float32]:
-        """Grey levels (N, rows, cells) of the strip along each candidate."""
+        """Grey levels (N, rows, cells) of the strip along each curve."""
         scaling = Scaling(min(1.0, self.detail_width / view.width))
         reach = (along.below * along.leaning[:, None] * scaling.factor).astype(np.float32)
         columns = scaling.to_working(along.x).astype(np.float32)[:, :, None] + reach[:, :, None] * self._across()
@@ -86,9 +99,13 @@ class Refinement:
         contrast = self._contrast(strip, self.bars[0] / leaning)
         for bar in self.bars[1:]:
             np.maximum(contrast, self._contrast(strip, bar / leaning), out=contrast)
-        # Five grey levels above its own row's unrest is a bar that an eye would see.
+        # Five grey levels above its own row's unrest is a bar that an eye would see. Squared: a few bright dots count
+        # for more than a wheel track that is a little lighter all along.
         unrest = np.abs(contrast).mean(axis=1, keepdims=True)
-        return np.asarray(np.clip((contrast - unrest) / (unrest + 5.0), 0.0, 1.0), dtype=np.float32)
+        place = int((1.0 - _BEST_ROWS) * (len(contrast) - 1))
+        best = max(0.0, float(np.partition(contrast.max(axis=1), place)[place]))
+        bars = np.clip((contrast - unrest) / (unrest + 5.0 + self.fair * best), 0.0, 1.0)
+        return np.asarray(bars * bars, dtype=np.float32)
 
     def _contrast(self, strip: NDArray[np.float32], bar: float) -> NDArray[np.float32]:
         """How much brighter a bar is than the brighter one of its neighbours of the same width."""
@@ -98,7 +115,7 @@ class Refinement:
         return np.asarray(mean - np.maximum(sides[:, : -2 * width], sides[:, 2 * width :]), dtype=np.float32)
 
     def _fits(self, along: _Along, bars: NDArray[np.float32], view: RoadView) -> list[Fit]:
-        """Columns at the anchor rows by least squares with the candidates as the prior."""
+        """Columns at the anchor rows by least squares with the curves so far, and the road they share, as the prior."""
         anchors = view.horizon + np.asarray(self.anchors) * view.depth
         to_curve = np.linalg.inv(curve_basis(view.horizon, anchors))
         basis = curve_basis(view.horizon, along.y) @ to_curve
@@ -108,19 +125,21 @@ class Refinement:
         # Sums over a strip's cells, and sums of where they are, in one product.
         across = self._across()
         sums = np.stack([np.ones_like(across), across], axis=1)
-        shift, normal = np.zeros((len(bars), 3)), prior
+        boundaries = Boundaries(curve_columns(along.curves, anchors), to_curve, along.leaning, view.depth)
+        found, normal = self.road.begun(boundaries), prior
         for reach in self.steps:
-            seen = (basis @ shift[:, :, None])[:, :, 0] / (along.below * leaning)
+            seen = (basis @ found.shifts[:, :, None])[:, :, 0] / (along.below * leaning)
             off = (across - seen.astype(np.float32)[:, :, None]) * np.float32(1.0 / reach)
             total, moment = np.moveaxis((bars / (1.0 + off * off) ** 2) @ sums, 2, 0).astype(np.float64)
             centre = moment / np.maximum(total, 1e-6) * along.below * leaning
             # A row counts once, however wide its bar; a row without a bar does not count.
             trusted = basis.swapaxes(1, 2) * (np.minimum(total / 2.0, 1.0) / sigma**2)[:, None]
             normal = prior + trusted @ basis
-            shift = np.linalg.solve(normal, trusted @ centre[:, :, None])[:, :, 0]
+            found = self.road.agree(normal, (trusted @ centre[:, :, None])[:, :, 0], boundaries, found)
         # Neighbouring rows share their errors: about four of them are worth one.
-        covariances = to_curve @ np.linalg.inv(prior + (normal - prior) / 4.0) @ to_curve.T
-        curves = curves_through(view.horizon, anchors, curve_columns(along.curves, anchors) + shift)
+        worth = self.road.agree(prior + (normal - prior) / 4.0, np.zeros_like(found.shifts), boundaries, found)
+        covariances = to_curve @ worth.covariances @ to_curve.T
+        curves = curves_through(view.horizon, anchors, boundaries.columns + found.shifts)
         return [Fit(curve, covariance) for curve, covariance in zip(curves, covariances, strict=True)]
 
 
@@ -139,11 +158,10 @@ class _Along:
     leaning: FloatArray
 
     @classmethod
-    def of(cls, candidates: Sequence[Candidate], view: RoadView, rows: int) -> _Along:
-        """`rows` rows along each candidate."""
-        curves = tuple(candidate.curve for candidate in candidates)
-        top, bottom = np.array([(candidate.top, candidate.bottom) for candidate in candidates]).T
+    def of(cls, curves: Sequence[Curve], spans: Sequence[tuple[float, float]], view: RoadView, rows: int) -> _Along:
+        """`rows` rows along each of the `curves`, between the rows (top, bottom) of its span."""
+        top, bottom = np.array(spans).T
         y = np.linspace(top, bottom, rows, axis=1)
         slope = [float(curve.slope(middle)) for curve, middle in zip(curves, 0.5 * (top + bottom), strict=True)]
         leaning = np.maximum(1.0, np.hypot(1.0, slope) / USUAL_LEANING)
-        return cls(curves, y, curve_columns(curves, y), y - view.horizon, leaning)
+        return cls(tuple(curves), y, curve_columns(curves, y), y - view.horizon, leaning)
