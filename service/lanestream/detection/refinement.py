@@ -117,7 +117,7 @@ class Refinement:
     def _fits(self, along: _Along, bars: NDArray[np.float32], view: RoadView) -> list[Fit]:
         """Columns at the anchor rows by least squares with the curves so far, and the road they share, as the prior."""
         anchors = view.horizon + np.asarray(self.anchors) * view.depth
-        to_curve = np.linalg.inv(curve_basis(view.horizon, anchors))
+        to_curve = np.asarray(np.linalg.inv(curve_basis(view.horizon, anchors)), dtype=float)
         basis = curve_basis(view.horizon, along.y) @ to_curve
         leaning = along.leaning[:, None]
         sigma = self.noise * view.width / 640.0 + self.blur * along.below
