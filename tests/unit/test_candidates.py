@@ -62,12 +62,21 @@ def test_a_known_horizon_is_kept_but_for_a_nod() -> None:
 
 def test_followed_boundaries_come_first_and_fewer_others_with_them() -> None:
     still = fair_scene(640, 360)
-    found = CandidateSearch().propose(still.image).candidates
+    search = CandidateSearch(faintest=0.0)
+    found = search.propose(still.image).candidates
     expected = [found[-1].curve]
-    followed = CandidateSearch().propose(still.image, still.horizon, expected).candidates
+    followed = search.propose(still.image, still.horizon, expected).candidates
     assert len(found) == 16
     assert len(followed) == 12
     assert followed[0].curve == expected[0]
+
+
+def test_faint_lines_are_no_candidates() -> None:
+    still = fair_scene(640, 360)
+    every = CandidateSearch(faintest=0.0).propose(still.image).candidates
+    strong = CandidateSearch(faintest=0.3).propose(still.image).candidates
+    assert min(c.strength for c in every) < 0.3 <= min(c.strength for c in strong)
+    assert strong == every[: len(strong)]
 
 
 @pytest.mark.parametrize("share", [0.0001, 0.1, 0.9, 0.99, 0.9999])

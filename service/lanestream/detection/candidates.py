@@ -13,8 +13,9 @@ from lanestream.detection.fan import Fan
 from lanestream.detection.hough import ExtendedHough, HoughLines
 from lanestream.detection.lattice import Lattice
 from lanestream.detection.lines import FAR, NEAR, Lines, told_rows
-from lanestream.detection.perspective import Perspective, PerspectiveSearch, find_ridges
+from lanestream.detection.perspective import Perspective, PerspectiveSearch
 from lanestream.detection.prior import RoadPrior
+from lanestream.detection.ridges import Ridges, RidgeSearch
 from lanestream.detection.vanishing import VanishingPointSearch
 from lanestream.geometry import RoadView, Scaling, visible_spans
 from lanestream.lanes import Candidate, Curve, FloatArray, Image
@@ -54,6 +55,14 @@ class Survey:
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What a frame shows of its road: Hough lines and ridges of the working image."""
+
+    lines: HoughLines
+    ridges: Ridges
+
+
+@dataclass(frozen=True)
 class CandidateSearch:
     """How candidates are found: Hough lines and their pairs, lines of the fan, then suppression.
 
@@ -63,15 +72,17 @@ class CandidateSearch:
     fewer are needed. Two edges are one marking where their distance is `least_width` to `most_width` times the rows
     below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for double lines). Candidates nearer
     than `separation` times the rows below the horizon, at two rows, are the same. Where there is a prior but no known
-    horizon, lines found without the prior count `unguided` times their strength.
+    horizon, lines found without the prior count `unguided` times their strength. Lines fainter than `faintest`, where
+    the strongest of their kind has 1, are hardly ever boundaries, and are no candidates.
     """
 
     hough: ExtendedHough = ExtendedHough()
     vanishing: VanishingPointSearch = VanishingPointSearch()
+    ridges: RidgeSearch = RidgeSearch()
     perspective: PerspectiveSearch = PerspectiveSearch()
     sources: tuple[Source, ...] = ("pairs", "singles", "rays")
     near_prior: PerspectiveSearch = PerspectiveSearch(
-        spread_x=0.03, nod=0.01, spread_bend=0.015, ridges=600, rounds=((5, 0.8), (5, 0.3), (5, 0.1))
+        spread_x=0.03, nod=0.01, spread_bend=0.015, ridges=300, rounds=((3, 0.7), (3, 0.35), (3, 0.12))
     )
     fan: Fan = Fan()
     limit: int = 16
@@ -80,6 +91,7 @@ class CandidateSearch:
     most_width: float = 0.4
     separation: float = 0.05
     unguided: float = 0.6
+    faintest: float = 0.06
 
     def survey(self, image: Image, horizon: float | None = None) -> Survey:
         """What can be seen of a BGR image (H, W, 3) uint8 before there is a prior; `horizon` as for `propose`."""
@@ -111,60 +123,59 @@ class CandidateSearch:
         grey, scaling = survey.grey, survey.scaling
         guide = prior if prior is not None and prior.curves else None
         if guide is None:
-            point, lines = self._road(grey, None if horizon is None else scaling.to_working(horizon), survey.lines)
+            point, seen = self._road(grey, None if horizon is None else scaling.to_working(horizon), survey.lines)
         else:
-            point, lines = self._seen_road(survey, guide)
+            point, seen = self._seen_road(survey, guide)
         view = RoadView(grey.shape[1], grey.shape[0], point.y)
         first = [Lines.along(expected, scaling, view)]
-        found = [self._found(grey, view, point, lines)]
+        found = [self._found(seen, view, point)]
         if guide is not None:
             lattice = _lattice(guide, scaling, view, point)
             found = [found[0].weighed(lattice.trust(_slopes(found[0], view, point)))]
             if horizon is None:
                 found.append(self._unguided(grey, scaling, view))
             first += [Lines.along(guide.curves, scaling, view), _neighbours(lattice, view, point)]
-        ranked = Lines.joined([*first, Lines.joined(found).ranked])
+        ranked = Lines.joined([*first, Lines.joined(found).strong(self.faintest).ranked])
         kept = ranked.taken(ranked.apart(self.separation, view))
         image_view = RoadView(width, height, scaling.to_image(point.y))
         candidates = _candidates(kept, _curves(kept, scaling, view, point), image_view)
         limit = min(self.limit, self.followed) if expected else self.limit
         return Proposals(tuple(candidates[:limit]), image_view, point.weight)
 
-    def _seen_road(self, survey: Survey, prior: RoadPrior) -> tuple[Perspective, HoughLines]:
-        """The perspective of a prior, moved to where ridges gather, and the Hough lines below its horizon."""
-        grey = survey.grey
-        height, width = grey.shape
+    def _seen_road(self, survey: Survey, prior: RoadPrior) -> tuple[Perspective, Evidence]:
+        """The perspective of a prior, moved to where ridges gather, and what is seen of the road below its horizon."""
+        height, width = survey.grey.shape
         guess = _perspective(prior, survey.scaling, height)
-        ridges = find_ridges(grey, guess.y, self.near_prior.ridges)
+        ridges = self.ridges.find(survey.grey, guess)
         point = self.near_prior.refine(guess, ridges, width, height - 1.0, known=True)
-        return point, survey.lines or self._edges_and_lines(grey, point.y)
+        return point, Evidence(survey.lines or self._edges_and_lines(survey.grey, point.y), ridges)
 
     def _road(
         self, grey: Image, horizon: float | None, lines: HoughLines | None = None
-    ) -> tuple[Perspective, HoughLines]:
-        """The perspective of the working image and the Hough lines of its road, where they are not known yet."""
+    ) -> tuple[Perspective, Evidence]:
+        """The perspective of the working image and what is seen of its road; its Hough lines may be known already."""
         height, width = grey.shape
         lowest = LOWEST_HORIZON * height
         horizon = None if horizon is None else min(horizon, lowest)
         lines = lines or self._edges_and_lines(grey, 0.42 * height if horizon is None else horizon)
         first = self.vanishing.find(lines, width, height, horizon)
         guess = Perspective(first.x, first.y, 0.0, first.weight)
-        ridges = find_ridges(grey, guess.y, self.perspective.ridges)
+        ridges = self.ridges.find(grey, guess)
         point = self.perspective.refine(guess, ridges, width, height - 1.0, horizon is not None)
-        return replace(point, y=min(point.y, lowest)), lines
+        return replace(point, y=min(point.y, lowest)), Evidence(lines, ridges)
 
     def _edges_and_lines(self, grey: Image, top: float) -> HoughLines:
         """The Hough lines of the rows from `top` down."""
         height, width = grey.shape
         return self.hough.lines(find_edges(grey, int(np.clip(top, 0, height - 16))), width, height - 1.0)
 
-    def _found(self, grey: Image, view: RoadView, point: Perspective, lines: HoughLines) -> Lines:
+    def _found(self, seen: Evidence, view: RoadView, point: Perspective) -> Lines:
         """Lines of both searches: each one's strengths count against its own strongest."""
         hough = [
-            *([self._pairs(lines, view, point)] if "pairs" in self.sources else ()),
-            *([self._singles(lines, view, point)] if "singles" in self.sources else ()),
+            *([self._pairs(seen.lines, view, point)] if "pairs" in self.sources else ()),
+            *([self._singles(seen.lines, view, point)] if "singles" in self.sources else ()),
         ]
-        rays = [self._rays(grey, view, point).normalised] if "rays" in self.sources else []
+        rays = [self._rays(seen.ridges, view, point).normalised] if "rays" in self.sources else []
         return Lines.joined([Lines.joined(hough).normalised, *rays])
 
     def _unguided(self, grey: Image, scaling: Scaling, view: RoadView) -> Lines:
@@ -172,14 +183,15 @@ class CandidateSearch:
 
         The lines keep their own perspective, and count for less than guided ones.
         """
-        point, lines = self._road(grey, None)
+        point, seen = self._road(grey, None)
         own = RoadView(view.width, view.height, point.y)
-        found = self._found(grey, own, point, lines)
+        found = self._found(seen, own, point)
         weights = self.unguided * found.strength
         return Lines.along(_curves(found, scaling, own, point), scaling, view).weighed(weights)
 
-    def _rays(self, grey: Image, view: RoadView, point: Perspective) -> Lines:
-        found = self.fan.lines(grey, point)
+    def _rays(self, ridges: Ridges, view: RoadView, point: Perspective) -> Lines:
+        """Lines through the vanishing point along which ridges gather."""
+        found = self.fan.lines(ridges, point, view.width, view.bottom)
         near, far = point.columns(found.slope, told_rows(view), view.bottom)
         return Lines.told(near, far, found.strength)
 

@@ -45,11 +45,13 @@ class HoughLines:
 class ExtendedHough:
     """The transform's settings.
 
-    `window` is how far from its gradient's direction a pixel votes, in degrees to either side; `max_slope` leaves out
-    lines flatter than that many columns a row; `limit` is the most lines that are handed on.
+    `window` is how far from its gradient's direction a pixel votes, in degrees to either side; cells are `cell` pixels
+    wide; `max_slope` leaves out lines flatter than that many columns a row; `limit` is the most lines that are handed
+    on.
     """
 
-    window: float = 12.0
+    window: int = 8
+    cell: float = 1.5
     max_slope: float = 7.0
     min_votes: float = 6.0
     limit: int = 80
@@ -61,11 +63,11 @@ class ExtendedHough:
         if not len(x):
             nothing = np.empty(0)
             return HoughLines(nothing, nothing, nothing > 0.0, nothing)
-        reach = int(np.ceil(np.hypot(origin_x, float(np.abs(y).max())))) + 2
+        reach = int(np.ceil(np.hypot(origin_x / self.cell, float(np.abs(y).max())))) + 2
         rho, theta, votes = self._peaks(self._accumulate(x, y, angle, weight, reach))
         radians = np.radians(theta)
         slope = -np.tan(radians)
-        x_bottom = origin_x + (rho - reach) / np.cos(radians)
+        x_bottom = origin_x + self.cell * (rho - reach) / np.cos(radians)
         return HoughLines(x_bottom, slope, np.cos(radians) > 0.0, votes)
 
     def _accumulate(
@@ -78,10 +80,12 @@ class ExtendedHough:
     ) -> NDArray[np.float32]:
         """Votes by rho, from -`reach` to `reach`, and theta, with `_PAD` columns of the other end at either end.
 
+        `x` and `y`, and so rho, are in cells.
+
         A pixel that lies at rho and t, across and along the line of its own direction, lies at rho cos d + t sin d
         across one that is turned by d.
         """
-        window = int(self.window)
+        window = self.window
         turns = np.radians(np.arange(-window, window + 1)).astype(np.float32)
         direction: NDArray[np.int32] = np.rint(angle).astype(np.int32) % _CIRCLE
         radians = np.radians(np.arange(_CIRCLE)).astype(np.float32)
@@ -108,10 +112,10 @@ class ExtendedHough:
     def _steep(
         self, edges: Edges, origin_x: float, origin_y: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Pixels that can belong to a line steep enough, about the origin; the others would only cost votes."""
+        """Pixels that can belong to a line steep enough, in cells from the origin; the others would only cost votes."""
         keep = np.flatnonzero(_from_upright(edges.angle) <= self._flattest)
         x, y = edges.x[keep] - np.float32(origin_x), edges.y[keep] - np.float32(origin_y)
-        return x, y, edges.angle[keep], edges.weight[keep]
+        return x / np.float32(self.cell), y / np.float32(self.cell), edges.angle[keep], edges.weight[keep]
 
     @property
     def _flattest(self) -> float:

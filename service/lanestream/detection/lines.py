@@ -62,6 +62,10 @@ class Lines:
         """The same, each one's strength times its weight (N,)."""
         return replace(self, strength=self.strength * weights)
 
+    def strong(self, least: float) -> Lines:
+        """Those whose strength is at least `least`."""
+        return self.taken(np.flatnonzero(self.strength >= least))
+
     @property
     def normalised(self) -> Lines:
         """The same, with the strongest one's strength as 1."""

@@ -9,13 +9,13 @@ gather at few values of b, so the three are searched for by how sharply they gat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.lanes import Image
+from lanestream.detection.ridges import Ridges
+from lanestream.lanes import FloatArray
 
 
 @dataclass(frozen=True)
@@ -30,54 +30,21 @@ class Perspective:
     bend: float
     weight: float
 
-    def columns(self, slopes: NDArray[np.float64], rows: NDArray[np.float64], bottom: float) -> NDArray[np.float64]:
+    def columns(self, slopes: FloatArray, rows: FloatArray, bottom: float) -> FloatArray:
         """Columns (rows, slopes) of the boundaries with the bottom `slopes` at `rows`, both one-dimensional."""
         below = np.maximum(rows - self.y, 1.0)[:, None]
-        columns: NDArray[np.float64] = self.x + below * slopes[None, :] + self.k(bottom) / below
+        columns: FloatArray = self.x + below * slopes[None, :] + self.k(bottom) / below
         return columns
+
+    def slopes(self, columns: FloatArray, rows: FloatArray, bottom: float) -> FloatArray:
+        """The bottom slopes (N,) of the boundaries through points, which are told by their columns and rows (N,)."""
+        below = np.maximum(rows - self.y, 1.0)
+        slopes: FloatArray = (columns - self.x - self.k(bottom) / below) / below
+        return slopes
 
     def k(self, bottom: float) -> float:
         """The bend in pixels squared, for an image whose lowest row is `bottom`."""
         return self.bend * (bottom - self.y) ** 2
-
-
-@dataclass(frozen=True)
-class RidgePoints:
-    """Centres of narrow bright bars, a row at a time: column, row and contrast (0 to 1) of each."""
-
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    weight: NDArray[np.float64]
-
-
-def find_ridges(grey: Image, horizon: float, limit: int, width: float = 0.1) -> RidgePoints:
-    """The `limit` strongest local maxima of a bar filter, `width` times the depth of each row wide, in a grey image."""
-    bottom = grey.shape[0] - 1
-    rows = np.unique(np.linspace(horizon + 0.08 * (bottom - horizon), bottom, 112).astype(int))
-    ridge = _bars(grey, rows, np.maximum(np.rint(0.5 * width * (rows - horizon)), 1).astype(int))
-    around = cv2.blur(np.abs(ridge), (161, 5))
-    # A peak from 0.15 of the contrast on; what is not even that need not be divided.
-    peak = (ridge == cv2.dilate(ridge, np.ones((1, 7), np.uint8))) & (ridge > 0.45 * around + 0.45)
-    found, at = np.nonzero(peak)
-    weight = np.minimum(ridge[found, at] / (3.0 * around[found, at] + 3.0), 1.0)
-    order = np.argsort(-weight, kind="stable")[:limit]
-    return RidgePoints(at[order].astype(float), rows[found[order]].astype(float), weight[order].astype(float))
-
-
-def _bars(grey: Image, rows: NDArray[np.int_], half: NDArray[np.int_]) -> NDArray[np.float32]:
-    """How much brighter bars of 2 `half` + 1 pixels are than the brighter one of their neighbours, row by row."""
-    columns = grey.shape[1]
-    margin = 3 * int(half.max()) + 2
-    wide = cv2.copyMakeBorder(grey[rows], 0, 0, margin, margin, cv2.BORDER_REPLICATE).astype(np.float32)
-    bars = np.empty((len(rows), columns), np.float32)
-    # Neighbouring rows have bars of the same width: they are filtered together.
-    starts = [0, *(np.flatnonzero(np.diff(half)) + 1).tolist()]
-    for start, stop in pairwise([*starts, len(rows)]):
-        side = 2 * int(half[start]) + 1
-        mean = cv2.blur(wide[start:stop], (side, 1))
-        left, right = (mean[:, at : at + columns] for at in (margin - side, margin + side))
-        bars[start:stop] = mean[:, margin : margin + columns] - np.maximum(left, right)
-    return bars
 
 
 @dataclass(frozen=True)
@@ -88,7 +55,7 @@ class PerspectiveSearch:
     the strongest bend; of a horizon that is known, the row is only `nod` away, as a camera nods on its wheels. Ridges
     gather in cells of `cell` image widths on the bottom row; `prior` is the share of the best score that a hypothesis
     at the end of its spread must make up for. Each of `rounds` tries so many values of all three, within so much of
-    the spread about the best ones so far, on `ridges` ridges.
+    the spread about the best ones so far, on the `ridges` strongest ridges.
     """
 
     spread_x: float = 0.12
@@ -101,10 +68,11 @@ class PerspectiveSearch:
     ridges: int = 1000
     rounds: tuple[tuple[int, float], ...] = ((7, 1.0), (5, 0.3), (5, 0.1))
 
-    def refine(self, guess: Perspective, ridges: RidgePoints, width: int, bottom: float, known: bool) -> Perspective:
+    def refine(self, guess: Perspective, ridges: Ridges, width: int, bottom: float, known: bool) -> Perspective:
         """`guess` moved to where `ridges` gather most; `known` tells that its row is."""
         if len(ridges.x) < 8:
             return guess
+        ridges = ridges.strongest(self.ridges)
         spread = np.array([self.spread_x * width, (self.nod if known else self.spread_y) * width, self.spread_bend])
         start = np.array([guess.x, guess.y, guess.bend])
         best = start
@@ -117,9 +85,7 @@ class PerspectiveSearch:
             best = axes[np.arange(3), place]
         return replace(guess, x=float(best[0]), y=float(best[1]), bend=float(best[2]))
 
-    def _gathering(
-        self, axes: NDArray[np.float64], ridges: RidgePoints, width: int, bottom: float
-    ) -> NDArray[np.float32]:
+    def _gathering(self, axes: NDArray[np.float64], ridges: Ridges, width: int, bottom: float) -> NDArray[np.float32]:
         """How much each hypothesis gathers: the histogram's variance about its smooth self, (N, N, N).
 
         `axes` (3, N) are the hypotheses' x, y and bends. The histogram is that of where the ridges' boundaries cross
