@@ -7,7 +7,7 @@ checkpoint loads as it is, and folding them leaves exactly the plain network.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -154,9 +154,14 @@ def normalise(patches: Tensor) -> Tensor:
 def initialise(network: AlexNet, weights: Path) -> None:
     """Takes over the convolutions and hidden layers of a torchvision AlexNet checkpoint; the last layer stays new.
 
-    Raises CheckpointError where the file is not one.
+    Raises CheckpointError where the file is not one, or the network is not as large as those are.
     """
     state = load_state(weights)
+    if network.shape != FULL:
+        full = "set " + ", ".join(f"{key} = {value}" for key, value in asdict(FULL).items())
+        raise CheckpointError(
+            f"{weights} is no checkpoint of a run, and the network is smaller than torchvision's", full
+        )
     wanted = {k: v for k, v in network.state_dict().items() if not k.startswith((*_NORMS, "classifier.6."))}
     wrong = [key for key, value in wanted.items() if key not in state or state[key].shape != value.shape]
     if wrong:
