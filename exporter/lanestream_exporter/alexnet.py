@@ -143,12 +143,13 @@ def normalise(patches: Tensor) -> Tensor:
     """RGB patches (N, H, W, 3) uint8, as the network wants them: (N, 3, H, W) float, each about zero.
 
     Each patch is measured against its own brightness and contrast, so that a road in the shadow looks like one in the
-    sun; the channels share both numbers, so that yellow stays yellow.
+    sun; the channels share both numbers, so that yellow stays yellow. Every fourth row tells them well enough.
     """
     images = patches.permute(0, 3, 1, 2).float() / 255.0
-    centred = images - images.mean(dim=(1, 2, 3), keepdim=True)
-    deviation = torch.sqrt((centred * centred).mean(dim=(1, 2, 3), keepdim=True))
-    return centred / (deviation + LEAST_CONTRAST)
+    told = images[:, :, ::4]
+    mean = told.mean(dim=(1, 2, 3), keepdim=True)
+    deviation = torch.sqrt(((told - mean) ** 2).mean(dim=(1, 2, 3), keepdim=True))
+    return (images - mean) / (deviation + LEAST_CONTRAST)
 
 
 def initialise(network: AlexNet, weights: Path) -> None:

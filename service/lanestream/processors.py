@@ -78,3 +78,8 @@ def _limit_1(group: Path) -> float | None:
 def _share(allowed: int, period: int) -> float | None:
     """Microseconds in every period of as many, as processors; none is no limit."""
     return allowed / period if allowed > 0 and period > 0 else None
+
+
+def network_threads() -> int:
+    """The threads of one network's run that leave room for the frames beside it: half of the processors."""
+    return max(1, processors() // 2)

@@ -24,7 +24,7 @@ from pydantic_settings import (
 from lanestream.errors import SettingsError
 from lanestream.imaging import MOST_PIXELS, ImageLimits
 from lanestream.keys import ApiKey, parse_keys
-from lanestream.processors import processors
+from lanestream.processors import network_threads, processors
 from lanestream.runtime import Provider, RuntimeOptions
 from lanestream.sessions.manager import SessionLimits
 from lanestream.sessions.stream_rules import StreamLimits
@@ -86,7 +86,7 @@ class Settings(BaseSettings):
     )
     provider: Provider = Field(default="auto", description="Where the networks run.")
     inference_threads: int = Field(
-        default_factory=lambda: max(1, processors() // 2),
+        default_factory=network_threads,
         ge=1,
         le=256,
         description="Threads of one network's run on the CPU, by default for half of the processors.",

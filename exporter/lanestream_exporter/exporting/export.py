@@ -49,7 +49,8 @@ class ExportSettings:
 class ExportReport:
     """What was measured on the same validation inputs: the checkpoint in PyTorch, the fp32 file, the written file.
 
-    `fp32` is the file of the same compressed network; it is the written one where that was asked for.
+    `fp32` is the file of the same compressed network; it is the written one where that was asked for. `timed_by` is the
+    provider that ran the files for their times.
     """
 
     subject: Subject
@@ -59,6 +60,7 @@ class ExportReport:
     fp32: Measured
     written: Measured
     boundaries: Boundaries
+    timed_by: str
 
     @property
     def lost(self) -> dict[str, float]:
@@ -144,7 +146,7 @@ def _measured(whole: Subject, subject: Subject, check: Check, files: dict[Precis
     for name, path in files.items():
         outputs, mean, largest = differences(OnnxModel.load(path, "cpu"), check, expected)
         figures = subject.figures(outputs, check)
-        rows[name] = Measured(name, figures, mean, largest, path.stat().st_size, times[name])
+        rows[name] = Measured(name, figures, mean, largest, path.stat().st_size, times.milliseconds[name])
     return ExportReport(
         subject,
         check.frames,
@@ -153,6 +155,7 @@ def _measured(whole: Subject, subject: Subject, check: Check, files: dict[Precis
         rows["fp32"],
         rows[name],
         boundaries(subject.detector, check, expected, outputs),
+        times.provider,
     )
 
 

@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import LaneDetector
-from lanestream.inference import OnnxModel
+from lanestream.inference import OnnxModel, load_network
+from lanestream.inference.providers import offered, without_gpus
 from lanestream.lanes import Detection
+from lanestream.processors import network_threads
+from lanestream.runtime import RuntimeOptions
 from lanestream_exporter.exporting.subject import Check, Figures
 
 BATCHES: Final = (1, 4, 16)
@@ -102,17 +105,27 @@ def _paired(one: Sequence[Detection], other: Sequence[Detection], scale: float) 
     return pairs
 
 
-def timed(paths: Mapping[str, Path], inputs: NDArray[np.uint8]) -> dict[str, float]:
-    """Milliseconds an input of each file on the CPU: the median over batches of 16, the files taking turns.
+@dataclass(frozen=True)
+class Times:
+    """Milliseconds an input of each file, and the `provider` that they are of."""
+
+    provider: str
+    milliseconds: Mapping[str, float]
+
+
+def timed(paths: Mapping[str, Path], inputs: NDArray[np.uint8]) -> Times:
+    """The time of each file as the service runs it on the CPU: the median over batches of 16, the files taking turns.
 
     Whatever else the machine does slows all of them alike, so that their ratio holds where the numbers don't.
     """
     batch = np.resize(inputs[: BATCHES[-1]], (BATCHES[-1], *inputs.shape[1:]))
-    models = {name: OnnxModel.load(path, "cpu") for name, path in paths.items()}
+    options, offer = RuntimeOptions(network_threads()), without_gpus(offered())
+    models = {name: load_network(path, "auto", options, offer) for name, path in paths.items()}
     taken: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(_ROUNDS + 2):
         for name, model in models.items():
             started = time.perf_counter()
             model.run(batch)
             taken[name].append(1e3 * (time.perf_counter() - started) / len(batch))
-    return {name: float(np.median(times[2:])) for name, times in taken.items()}
+    provider = next(iter(models.values())).provider
+    return Times(provider, {name: float(np.median(times[2:])) for name, times in taken.items()})

@@ -65,7 +65,7 @@ class RegressorSubject:
     input_name = "canvases"
     output_name = "readings"
     # Few weights and little time, but every output hangs on them, on a thousandth of an image's width.
-    exact = ("network.hidden.", "network.shape.", "network.doubts.")
+    exact = ("network.features.0.", "network.hidden.", "network.shape.", "network.doubts.")
     rank_energy = 0.9999
     headline = ("accuracy", "presence_accuracy")
 

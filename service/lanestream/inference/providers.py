@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Final, Literal
 
@@ -49,6 +49,11 @@ class Offer:
 def offered() -> Offer:
     """What is installed here."""
     return Offer(frozenset(onnxruntime.get_available_providers()), find_spec("openvino") is not None)
+
+
+def without_gpus(offer: Offer) -> Offer:
+    """The same on a machine without a GPU."""
+    return replace(offer, onnxruntime=offer.onnxruntime & {NAMES["cpu"]})
 
 
 def cuda_version() -> str | None:
