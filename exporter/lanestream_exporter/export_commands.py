@@ -131,9 +131,8 @@ def _tell(out: Path, report: ExportReport, source: FrameSource) -> None:
     for other, lost in report.lost.items():
         click.echo(f"{report.written.name} against {other}: {lost:.2f} points of accuracy lost")
     if report.time_ratio is not None:
-        click.echo(
-            f"{report.written.name} against fp32, the same network: {report.time_ratio:.2f} of the time ({report.timed_by})"
-        )
+        ratio = f"{report.time_ratio:.2f} of the time ({report.timed_by})"
+        click.echo(f"{report.written.name} against fp32, the same network: {ratio}")
     click.echo(f"{out}: {report.written.size or 0:,} bytes")
 
 

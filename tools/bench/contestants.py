@@ -18,6 +18,7 @@ from demo import LANESTREAM, free_port, stop
 
 from bench.orders import Kind
 from bench.plan import LITSERVE, NAIVE, SERVICE
+from lanestream.detection.candidates import CandidateSearch
 from lanestream.runtime import Provider
 
 READY_S: Final = 120.0
@@ -81,12 +82,18 @@ class Program:
     place: str
 
 
-def programs(provider: Provider, candidates: int) -> list[Program]:
-    """The servers; the naive one judges as many candidates a frame as ours does in the mean."""
+def programs(provider: Provider) -> list[Program]:
+    """The servers; the naive one judges as many candidates of a frame as ours does at most, of one in a stream."""
     python = (sys.executable, "-m")
     return [
         Program(SERVICE, "lanestream", (LANESTREAM, "serve", "--provider", provider), "/readyz", "ws:/v1/stream"),
-        Program(NAIVE, "bare", (*python, "bench.naive", "--candidates", str(candidates)), "/readyz", "ws:/stream"),
+        Program(
+            NAIVE,
+            "bare",
+            (*python, "bench.naive", "--candidates", str(CandidateSearch.followed)),
+            "/readyz",
+            "ws:/stream",
+        ),
         Program(LITSERVE, "http", (*python, "bench.lit", "--provider", provider), "/health", "http:/predict"),
     ]
 

@@ -155,7 +155,7 @@ def bench(clips: Clips, provider: Provider, folder: Path) -> Iterator[Bench]:
         for generator in generators:
             generator.hello()
         servers = []
-        for program in programs(provider, max(1, round(hello.patches))):
+        for program in programs(provider):
             servers.append(Server(program, folder))
             stack.callback(servers[-1].close)
         for server in servers:
