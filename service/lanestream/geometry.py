@@ -14,9 +14,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.lanes import Curve, FloatArray, curve_columns
+from lanestream.lanes import Candidate, Curve, FloatArray, curve_columns, curve_slopes
 
 T = TypeVar("T", float, FloatArray)
+
+FloatMaps = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -146,28 +148,18 @@ class StripGeometry:
         """How wide an image may be before the near rows of its strips alias: that of 640 pixels for patches of 112."""
         return self.size * 40 // 7
 
-    def rows(self, top: float, bottom: float) -> FloatArray:
-        """Image rows of the patch rows, from the top of the patch to its bottom; shape (size,)."""
-        return np.linspace(top, bottom, self.size)
-
-    def half_widths(self, rows: FloatArray, view: RoadView, slope: float) -> FloatArray:
-        """Half the strip's width in pixels at each of `rows`, for a candidate that leans by `slope`."""
+    def grids(self, candidates: Sequence[Candidate], view: RoadView) -> tuple[FloatMaps, FloatMaps]:
+        """Image columns and rows, each (N, size, size), that the pixels of the candidates' patches are sampled at."""
+        top, bottom = np.array([(candidate.top, candidate.bottom) for candidate in candidates]).T[:, :, None]
+        rows = top + (bottom - top) * np.linspace(0.0, 1.0, self.size)
+        curves = [candidate.curve for candidate in candidates]
+        slope = curve_slopes(curves, 0.5 * (top + bottom))
         least = self.min_half_width * view.width / 640.0
-        leaning = math.hypot(1.0, self.lean * slope)
-        widths: FloatArray = leaning * np.maximum(self.half_width * (rows - view.horizon), least)
-        return widths
-
-    def grid(
-        self, curve: Curve, top: float, bottom: float, view: RoadView, out: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Image columns and rows (2, size, size) that a patch's pixels are sampled at, written to `out` if given."""
-        rows = self.rows(top, bottom)
-        # Each is a part that is the same all along a row of the patch, and one that grows across it: one product.
-        parts = np.zeros((2, self.size, 2), np.float32)
-        parts[:, :, 0] = curve.x(rows), rows
-        parts[0, :, 1] = self.half_widths(rows, view, float(curve.slope(0.5 * (top + bottom))))
+        half_widths = np.hypot(1.0, self.lean * slope) * np.maximum(self.half_width * (rows - view.horizon), least)
         across = np.linspace(-1.0, 1.0, self.size, dtype=np.float32)
-        return np.matmul(parts, np.stack([np.ones_like(across), across]), out=out)
+        columns = half_widths.astype(np.float32)[:, :, None] * across
+        columns += curve_columns(curves, rows).astype(np.float32)[:, :, None]
+        return columns, np.broadcast_to(rows.astype(np.float32)[:, :, None], columns.shape)
 
 
 @dataclass(frozen=True)

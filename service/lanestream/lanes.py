@@ -60,10 +60,23 @@ def curves_through(horizon: float, rows: FloatArray, columns: FloatArray) -> lis
 
 def curve_columns(curves: Sequence[Curve], rows: FloatArray) -> FloatArray:
     """Columns (N, R) of N curves at once, at `rows` of their own (N, R) or the same for all (R,)."""
-    horizon, v, b, k = np.array([(curve.horizon, *curve.coefficients) for curve in curves]).reshape(-1, 4).T[:, :, None]
+    horizon, v, b, k = _told(curves)
     u = _depth(horizon, rows)
     columns: FloatArray = v + b * u + k / u
     return columns
+
+
+def curve_slopes(curves: Sequence[Curve], rows: FloatArray) -> FloatArray:
+    """dx/dy of N curves at once, at `rows` of their own (N, R) or the same for all (R,); shape (N, R)."""
+    horizon, _, b, k = _told(curves)
+    slopes: FloatArray = b - k / _depth(horizon, rows) ** 2
+    return slopes
+
+
+def _told(curves: Sequence[Curve]) -> FloatArray:
+    """Horizons and coefficients of N curves (4, N, 1)."""
+    told = np.array([(curve.horizon, *curve.coefficients) for curve in curves])
+    return told.reshape(-1, 4).T[:, :, None]
 
 
 def _depth(horizon: FloatArray | float, y: FloatArray | float) -> FloatArray:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanestream.geometry import RoadView, Scaling, StripGeometry, visible_rows
-from lanestream.lanes import Curve, curve_basis
+from lanestream.lanes import Candidate, Curve, curve_basis
 
 VIEW = RoadView(640, 360, 160.0)
 
@@ -61,7 +61,9 @@ def test_visible_rows_stop_where_the_curve_leaves_the_image() -> None:
 
 def test_strip_follows_its_curve_and_widens_with_the_road() -> None:
     curve = Curve(160.0, (320.0, 0.5, 400.0))
-    columns, rows = StripGeometry(size=33, half_width=0.5, lean=0.0).grid(curve, 200.0, 350.0, VIEW)
+    candidates = [Candidate(curve, 200.0, 350.0, 1.0), Candidate(curve, 190.0, 300.0, 1.0)]
+    (columns, other), (rows, _) = StripGeometry(size=33, half_width=0.5, lean=0.0).grids(candidates, VIEW)
+    assert not np.array_equal(columns, other)
     assert columns.shape == rows.shape == (33, 33)
     np.testing.assert_allclose(columns[:, 16], curve.x(rows[:, 16]), atol=1e-3)
     widths = columns[:, -1] - columns[:, 0]
@@ -69,8 +71,7 @@ def test_strip_follows_its_curve_and_widens_with_the_road() -> None:
 
 
 def test_a_leaning_strip_is_as_wide_across_its_candidate_as_an_upright_one() -> None:
-    leaning, upright = (
-        StripGeometry(size=33).grid(Curve(160.0, (320.0, slope, 0.0)), 200.0, 350.0, VIEW)[0] for slope in (3.0, 0.0)
-    )
+    candidates = [Candidate(Curve(160.0, (320.0, slope, 0.0)), 200.0, 350.0, 1.0) for slope in (3.0, 0.0)]
+    leaning, upright = StripGeometry(size=33).grids(candidates, VIEW)[0]
     across = (leaning[:, -1] - leaning[:, 0]) / np.hypot(1.0, 3.0)
     np.testing.assert_allclose(across, upright[:, -1] - upright[:, 0], rtol=1e-4)

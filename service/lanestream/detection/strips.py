@@ -49,13 +49,18 @@ class StripCutter:
         self, detail: Image, candidates: Sequence[Candidate], detail_view: RoadView, scaling: Scaling
     ) -> NDArray[np.uint8]:
         size = self.geometry.size
-        patches = np.empty((len(candidates), size, size, 3), np.uint8)
-        grid, warped = np.empty((2, size, size), np.float32), np.empty((size, size, 3), np.uint8)
-        for candidate, patch in zip(candidates, patches, strict=True):
-            curve = scaling.curve_to_working(candidate.curve)
-            top, bottom = scaling.to_working(candidate.top), scaling.to_working(candidate.bottom)
-            columns, rows = self.geometry.grid(curve, top, bottom, detail_view, out=grid)
-            # The border is mirrored: black would tell the network where the image ends, which no road does.
-            cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, dst=warped, borderMode=cv2.BORDER_REFLECT_101)
-            cv2.cvtColor(warped, cv2.COLOR_BGR2RGB, dst=patch)
-        return patches
+        if not candidates:
+            return np.empty((0, size, size, 3), np.uint8)
+        columns, rows = self.geometry.grids([_scaled(each, scaling) for each in candidates], detail_view)
+        # One below the other they are one image to OpenCV. The border is mirrored: black would tell the network where
+        # the image ends, which no road does.
+        maps = columns.reshape(-1, size), rows.reshape(-1, size)
+        strips = cv2.remap(detail, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        patches = cv2.cvtColor(strips, cv2.COLOR_BGR2RGB)
+        return np.asarray(patches, np.uint8).reshape(-1, size, size, 3)
+
+
+def _scaled(candidate: Candidate, scaling: Scaling) -> Candidate:
+    """The candidate in working pixels."""
+    top, bottom = scaling.to_working(candidate.top), scaling.to_working(candidate.bottom)
+    return Candidate(scaling.curve_to_working(candidate.curve), top, bottom, candidate.strength)
