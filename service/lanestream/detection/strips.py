@@ -26,7 +26,7 @@ class StripCutter:
     """
 
     geometry: StripGeometry = StripGeometry()
-    at_once: int = 6
+    at_once: int = 16
 
     def cut(self, image: Image, candidates: Sequence[Candidate], view: RoadView) -> NDArray[np.uint8]:
         """RGB patches (N, size, size, 3) uint8 of a BGR image (H, W, 3), in the order of `candidates`."""
