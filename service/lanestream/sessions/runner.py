@@ -52,14 +52,14 @@ class FrameRunner:
     `threads` frames are in work at a time, a thread each: enough to keep the processors and the networks busy. One more
     is handed over beforehand, so that a thread that is done goes on without waiting for the event loop. The others wait
     for their turn before anything is spent on them, so that however many there are, a frame that is begun is soon done.
-    Frames that are wanted fresh leave one thread alone: the last bit of throughput would cost them more time than it is
+    Frames that are wanted fresh leave two threads alone: the last bit of throughput would cost them more time than it is
     worth. `observe` is told of every batch that the networks run.
     """
 
     def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._limits = limits
         self._turns = asyncio.Semaphore(threads + 1)
-        self._fresh_turns = asyncio.Semaphore(max(1, threads - 1))
+        self._fresh_turns = asyncio.Semaphore(max(1, threads - 2))
         self._frames = 0
         self._crowd = threads // 2 + 1
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
