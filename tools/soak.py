@@ -24,10 +24,12 @@ from demo import service_process
 from soak_camera import FRAME_S, BrokenPromiseError, Camera
 
 from lanestream.local import LocalEngine
+from lanestream.protocol import LanesMessage
 from lanestream_exporter.scenes import render_still, sample_scene
 
 _EVERY_S = 1.0
 _SIZE = (640, 360)
+_SURE = 0.8
 # Shares of the run that count as the warm-up, and at either end of what follows it as the beginning and the end.
 _WARM, _ENDS = 1 / 3, 0.15
 
@@ -65,7 +67,7 @@ def cameras(url: str, count: int, seed: int) -> list[Camera]:
 
 
 def pictures(count: int, seed: int) -> list[bytes]:
-    """JPEG files of rendered roads that are seen alike again and again, so that ids have no reason to change."""
+    """JPEG files of rendered roads whose ego lane is surely seen again and again: ids have no reason to change."""
     engine = LocalEngine.load(None, "auto")
     rng = np.random.default_rng(seed)
     found: list[bytes] = []
@@ -77,9 +79,14 @@ def pictures(count: int, seed: int) -> list[bytes]:
         times = np.cumsum([FRAME_S] * 12 + [0.3] * 12)
         seen = [camera.lanes(picture, seq=i, timestamp=time) for i, time in enumerate(times.tolist())]
         egos = {(told.ego.left, told.ego.right) for told in seen}
-        if len(egos) == 1 and None not in egos.pop():
+        if len(egos) == 1 and all(_is_sure(told) for told in seen):
             found.append(picture)
     return found
+
+
+def _is_sure(told: LanesMessage) -> bool:
+    """Whether both boundaries of the ego lane were found, and not by a hair."""
+    return sum(lane.position in (-1, 1) and lane.probability > _SURE for lane in told.lanes) == 2
 
 
 async def soak(url: str, process: int, crew: list[Camera], seconds: float) -> list[Vitals]:
