@@ -88,6 +88,8 @@ def test_bursts_of_answers_do_not_change_a_rate(burst: int, sessions: int) -> No
 
 
 def test_a_rate_of_too_few_answers_is_a_count() -> None:
+    pairs = tuple(Answer(session, 0.0, session + end) for session in range(3) for end in (0.0, 0.1))
+    assert Sample(pairs, 0, 3.0, 0.0, 1.0, 0.0, settled=False).fps == pytest.approx(2.0)
     assert sample(1.0, seconds=1.0).fps == pytest.approx(1.0)
     assert Sample((), 0, 2.0, 0.0, 1.0, 0.0, settled=False).fps == 0.0
 

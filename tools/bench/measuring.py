@@ -52,12 +52,15 @@ class Sample:
         """Answers a second: the sum of what each session had after its first ones, until its last one.
 
         Answers come in bursts, of many sessions or of a batch, so that a count would depend on where the seconds begin.
+        Where some sessions had none before the clock started, the few that others had tell no rate: they are counted.
         """
         ends: dict[int, list[float]] = {}
         for answer in self.answers:
             ends.setdefault(answer.session, []).append(answer.answered)
         rates = [_rate(sorted(times)) for times in ends.values()]
-        return len(self.answers) / self.seconds if None in rates else sum(rate for rate in rates if rate is not None)
+        if not self.settled or None in rates:
+            return len(self.answers) / self.seconds
+        return sum(rate for rate in rates if rate is not None)
 
     @property
     def milliseconds(self) -> list[float]:

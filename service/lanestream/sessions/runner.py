@@ -52,8 +52,8 @@ class FrameRunner:
     `threads` frames are in work at a time, a thread each: enough to keep the processors and the networks busy. One more
     is handed over beforehand, so that a thread that is done goes on without waiting for the event loop. The others wait
     for their turn before anything is spent on them, so that however many there are, a frame that is begun is soon done.
-    Frames that are wanted fresh leave two threads alone: the last bit of throughput would cost them more time than it is
-    worth. `observe` is told of every batch that the networks run.
+    Frames that are wanted fresh leave two threads alone: the last bit of throughput would cost them more time than it
+    is worth. `observe` is told of every batch that the networks run.
     """
 
     def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
