@@ -81,8 +81,12 @@ class ExpiredError(LanestreamError):
 
     code = "expired"
 
-    def __init__(self) -> None:
-        super().__init__("the frame waited too long", "the service is busy: send it again, or fewer frames a second")
+    def __init__(
+        self,
+        message: str = "the frame waited too long",
+        hint: str = "the service is busy: send it again, or fewer frames a second",
+    ) -> None:
+        super().__init__(message, hint)
 
 
 class BusyError(LanestreamError):
