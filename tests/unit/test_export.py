@@ -134,7 +134,8 @@ def test_the_regressors_small_layers_stay_exact_in_int8(regressor: Exported, tmp
     export.quantized(regressor.path, small, regressor.check.inputs, subject.exact)
     weights = {tensor.name: tensor.data_type for tensor in onnx.load(str(small)).graph.initializer}
     floats = [name for name, kind in weights.items() if kind == onnx.TensorProto.FLOAT and name.endswith("weight")]
-    assert {name.split(".")[1] for name in floats} == {"hidden", "shape", "doubts"}
+    assert {name.split(".")[1] for name in floats} == {"features", "hidden", "shape", "doubts"}
+    assert [name for name in floats if ".features." in name] == ["network.features.0.weight"]
     info = OnnxModel.load(regressor.path, "cpu").info
     describe(small, info)
     expected = in_batches(subject.served(), regressor.check.inputs).numpy()

@@ -24,6 +24,7 @@ from lanestream_exporter.training.config import (
     read_config,
 )
 from lanestream_exporter.training.loop import Batch, Progress, Run, rate_at
+from lanestream_exporter.training.regressor import RegressorConfig
 
 
 class Parity:
@@ -135,7 +136,7 @@ def test_the_average_follows_the_weights_and_forgets_the_first_ones() -> None:
 
 
 def test_schedules() -> None:
-    cosine = TrainConfig(steps=1000, schedule=Cosine(warm_up=100))
+    cosine = TrainConfig(steps=1000, optimiser=AdamW(learning_rate=3e-4), schedule=Cosine(warm_up=100))
     assert rate_at(cosine, 49) == pytest.approx(1.5e-4, rel=0.01)
     assert rate_at(cosine, 500) == pytest.approx(1.5e-4)
     assert rate_at(cosine, 999) < 1e-8
@@ -145,6 +146,8 @@ def test_schedules() -> None:
 
 def test_the_shipped_configurations_are_read() -> None:
     assert read_config(Path("classifier"), ClassifierConfig) == ClassifierConfig()
+    regressor = read_config(Path("regressor"), RegressorConfig)
+    assert regressor.model_copy(update={"initial": None}) == RegressorConfig()
     published = read_config(SHIPPED / "classifier-published.toml", ClassifierConfig)
     assert published.optimiser == Sgd(kind="sgd", learning_rate=0.001, momentum=0.9, weight_decay=1e-4)
     assert published.batch == 15

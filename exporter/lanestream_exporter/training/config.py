@@ -28,7 +28,7 @@ class AdamW(Section):
     """I. Loshchilov and F. Hutter, "Decoupled weight decay regularization", 2019."""
 
     kind: Literal["adamw"] = "adamw"
-    learning_rate: PositiveFloat = 3e-4
+    learning_rate: PositiveFloat = 6e-4
     weight_decay: Annotated[float, Field(ge=0.0)] = 0.02
 
 
@@ -65,9 +65,9 @@ class TrainConfig(Section):
     """
 
     seed: NonNegativeInt = 1
-    steps: PositiveInt = 1600
+    steps: PositiveInt = 4000
     batch: Annotated[int, Field(ge=2)] = 96
-    check_every: PositiveInt = 200
+    check_every: PositiveInt = 400
     ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.998
     clip: Annotated[float, Field(ge=0.0)] = 5.0
     initial: str | None = None
