@@ -16,6 +16,8 @@ from typing import Any, Final
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
+from lanestream.tracking import TrackerSettings
+
 SUBPROTOCOL: Final = "lanestream.v1"
 FRAME_S: Final = 0.04
 _ANSWER_S: Final = 30.0
@@ -43,6 +45,7 @@ class Camera:
     pending: deque[int] = field(default_factory=deque)
     answered: int = -1
     ids: dict[int, int] = field(default_factory=dict)
+    told_s: float = 0.0
     counts: Counter[str] = field(default_factory=Counter)
     sent_here: int = 0
 
@@ -176,7 +179,13 @@ class Camera:
                 self._check_ids(told)
 
     def _check_ids(self, told: dict[str, Any]) -> None:
-        """A boundary that is told in two answers in a row, on whichever sockets, has one id."""
+        """A boundary that is told in two answers in a row, on whichever sockets, has one id.
+
+        Where there were no answers for longer than boundaries are followed unseen, they are new ones.
+        """
+        unseen_s, self.told_s = told["timestamp"] - self.told_s, told["timestamp"]
+        if unseen_s > TrackerSettings.coast_s:
+            self.ids = {}
         ids = {lane["position"]: lane["track_id"] for lane in told["lanes"] if lane["position"] in (-1, 1)}
         same = all(ids[position] == self.ids.get(position, ids[position]) for position in ids)
         self._expect(same, f"at frame {told['seq']} the ids {self.ids} became {ids}")

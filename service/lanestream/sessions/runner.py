@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -22,6 +22,7 @@ from lanestream.errors import ExpiredError
 from lanestream.imaging import ImageLimits, Picture, decode, decode_reduced
 from lanestream.inference.batcher import Answer, Batcher, BatchReport
 from lanestream.messages import ProcessedFrame
+from lanestream.sessions.turns import Turns
 from lanestream.sessions.walk import FrameWalk
 
 if TYPE_CHECKING:
@@ -58,18 +59,15 @@ class FrameRunner:
 
     def __init__(self, limits: ImageLimits, threads: int, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._limits = limits
-        self._turns = asyncio.Semaphore(threads + 1)
-        self._fresh_turns = asyncio.Semaphore(max(1, threads - 2))
+        self._turns = Turns(threads + 1, fresh=max(1, threads - 2))
         self._frames = 0
         self._crowd = threads // 2 + 1
         self._workers = ThreadPoolExecutor(threads, thread_name_prefix="lanestream-frames")
         self._batcher = Batcher(observe)
 
-    @asynccontextmanager
-    async def turn(self, *, fresh: bool = False) -> AsyncIterator[None]:
+    def turn(self, *, fresh: bool = False) -> AbstractAsyncContextManager[None]:
         """A place among the frames in work, first come, first served; to be had before `run`."""
-        async with self._fresh_turns if fresh else nullcontext(), self._turns:
-            yield
+        return self._turns.turn(fresh=fresh)
 
     async def run(self, session: Session, frame: EncodedFrame) -> ProcessedFrame:
         """The lanes of `frame`.
