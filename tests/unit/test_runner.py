@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from typing import Any
 
 import fakes
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lanestream.detection import Findings, Pipeline, Prepared
 from lanestream.engine import Engine
 from lanestream.imaging import ImageLimits
-from lanestream.lanes import Curve, Image
+from lanestream.lanes import Image
 from lanestream.messages import ProcessedFrame
 from lanestream.sessions.runner import EncodedFrame, FrameRunner
 
@@ -32,15 +32,8 @@ class Counting(fakes.FakeNetwork):
 class InParts(fakes.FakeDetector):
     """Makes its inputs, of three shades, part by part, and checks that the answers come in their order."""
 
-    def prepare(
-        self,
-        image: Image,
-        horizon: float | None = None,
-        expected: Sequence[Curve] = (),
-        prior: object = None,
-        survey: object = None,
-    ) -> Prepared:
-        whole = super().prepare(image, horizon, expected, prior, survey)
+    def prepare(self, image: Image, *known: Any, **more: Any) -> Prepared:
+        whole = super().prepare(image, *known, **more)
         parts = tuple(lambda shade=shade: np.full((2, 8, 8, 3), shade, np.uint8) for shade in (10, 20, 30))
         return Prepared(image, parts, whole.view, (), 1.0)
 
