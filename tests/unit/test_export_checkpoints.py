@@ -84,6 +84,12 @@ def test_a_network_is_as_large_as_its_run_made_it(saved: Any) -> None:
         assert subject.network(torch.zeros(1, 3, 112, 112)).shape == (1, 2)
 
 
+@pytest.mark.parametrize("told", ["large", {"size": 20}, {"size": 112, "depth": 3}])
+def test_a_size_that_is_none_is_told_in_one_line(saved: Any, theirs: Weights, told: object) -> None:
+    with pytest.raises(CheckpointError, match="does not say how large its network is"):
+        read_subject(saved({"network": theirs, "record": {"config": {"network": told}}}))
+
+
 def test_a_checkpoint_without_a_record_says_so(saved: Any, theirs: Weights) -> None:
     assert read_subject(saved({"network": theirs, "step": 3}))[1]["data"] == "not recorded"
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from pydantic import ValidationError
 from torch import Tensor, nn
 
 from lanestream.errors import CheckpointError
@@ -17,6 +18,7 @@ from lanestream_exporter.exporting.classifier import ClassifierSubject
 from lanestream_exporter.exporting.regressor import RegressorSubject
 from lanestream_exporter.exporting.subject import Subject
 from lanestream_exporter.regressor import LaneRegressor
+from lanestream_exporter.training.config import NetworkSize
 
 _LANE: Final = "lane"
 _LAST: Final = "classifier.6.weight"
@@ -56,13 +58,24 @@ def read_subject(path: Path, foreign: Foreign | None = None) -> tuple[Subject, d
 
 def _own(path: Path, state: Mapping[str, Any]) -> Subject:
     weights = state["network"]
-    config = (state.get("record") or {}).get("config") or {}
-    shape = Shape(**config["network"]) if "network" in config else FULL
+    shape = _recorded_shape(path, state)
     if "shape.0.weight" in weights:
         regressor = LaneRegressor(shape, normalised=_has_norms(weights))
         _load(path, regressor, weights)
         return RegressorSubject(regressor.eval().folded())
     return ClassifierSubject(_alexnet(path, weights, shape), strip=StripGeometry(shape.size))
+
+
+def _recorded_shape(path: Path, state: Mapping[str, Any]) -> Shape:
+    """How large the run made its network; runs that did not record it made the whole AlexNet."""
+    config = (state.get("record") or {}).get("config") or {}
+    if "network" not in config:
+        return FULL
+    try:
+        return NetworkSize.model_validate(config["network"]).shape
+    except ValidationError:
+        hint = "give a best.pt as the trainer wrote it"
+        raise CheckpointError(f"{path} does not say how large its network is", hint) from None
 
 
 def _foreign(path: Path, weights: Mapping[str, Tensor], foreign: Foreign) -> ClassifierSubject:
