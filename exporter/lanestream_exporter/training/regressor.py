@@ -141,8 +141,11 @@ def starting_regressor(config: RegressorConfig) -> LaneRegressor:
         return network
     state = load_state(Path(config.initial)).get("network")
     wanted = network.state_dict()
-    if not isinstance(state, dict) or any(key not in state for key in wanted if key.startswith(("features", "norms"))):
-        hint = "give the best.pt of a classifier's or a regressor's run"
+    convolutions = [key for key in wanted if key.startswith(("features", "norms"))]
+    if not isinstance(state, dict) or any(
+        key not in state or state[key].shape != wanted[key].shape for key in convolutions
+    ):
+        hint = "give the best.pt of a classifier's or a regressor's run with the same [network] width"
         raise CheckpointError(f"{config.initial} holds no convolutions of this network", hint)
     fitting = {key: value for key, value in state.items() if key in wanted and value.shape == wanted[key].shape}
     network.load_state_dict(fitting, strict=False)
