@@ -8,7 +8,7 @@ import pytest
 
 from lanestream.detection.candidates import CandidateSearch
 from lanestream.detection.lattice import Lattice
-from lanestream.detection.prior import RoadPrior
+from lanestream.detection.prior import RoadPrior, SeenBoundary
 from lanestream.geometry import RoadView
 from lanestream.lanes import Curve, Image
 
@@ -43,7 +43,8 @@ def faint_road(bend: float) -> tuple[Image, RoadPrior]:
     for curve in curves:
         line = np.stack([curve.x(rows), rows], axis=1).round().astype(np.int32)
         cv2.polylines(image, [line], isClosed=False, color=(125.0, 125.0, 125.0), thickness=3)
-    return image.clip(0, 255).astype(np.uint8), RoadPrior(view, curves[0], curves[1])
+    left, right = (SeenBoundary(curve, np.full(2, 0.05), 1.0) for curve in curves[:2])
+    return image.clip(0, 255).astype(np.uint8), RoadPrior(view, left, right)
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.02])

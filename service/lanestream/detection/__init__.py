@@ -34,7 +34,7 @@ class Prepared:
     The inputs (N, H, W, 3) uint8 are made `parts` by part, so that a network can be at work on one while the next is
     made; `inputs` are all of them. `view` is the road view that they were made in, and `horizon_weight` (0 to 1) tells
     how much of its horizon was found in this frame. `looks` are the views of the inputs one by one, where each has its
-    own. `glanced` is the row of the horizon that a glance at the frame saw; None without one.
+    own. `prior` is what a glance at the frame told; None without one.
     """
 
     image: Image
@@ -43,7 +43,7 @@ class Prepared:
     candidates: tuple[Candidate, ...] = ()
     horizon_weight: float = 0.0
     looks: tuple[RoadView, ...] = ()
-    glanced: float | None = None
+    prior: RoadPrior | None = None
 
     @cached_property
     def inputs(self) -> NDArray[np.uint8]:
@@ -225,4 +225,4 @@ class Pipeline:
         looking = self.glance.look(image, horizon if glanced is None else glanced)
         prior, survey = yield from beside(looking, lambda: self.detector.survey(image, horizon))
         prepared = self.detector.prepare(image, horizon, expected, prior, survey)
-        return replace(prepared, glanced=prior.view.horizon)
+        return replace(prepared, prior=prior)

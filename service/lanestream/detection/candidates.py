@@ -241,7 +241,7 @@ def _perspective(prior: RoadPrior, scaling: Scaling, height: int) -> Perspective
 
 def _lattice(prior: RoadPrior, scaling: Scaling, view: RoadView, point: Perspective) -> Lattice:
     slopes = iter(_slopes(Lines.along(prior.curves, scaling, view), view, point).tolist())
-    left, right = (None if curve is None else next(slopes) for curve in (prior.left, prior.right))
+    left, right = (None if boundary is None else next(slopes) for boundary in (prior.left, prior.right))
     return Lattice.of(left, right)
 
 

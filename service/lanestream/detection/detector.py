@@ -62,16 +62,21 @@ class CandidateDetector:
         return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)
 
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
-        """Detections from the classifier's probabilities (N, 2) for the patches of `prepare`, left to right."""
-        probability = outputs[:, TRUE_LANE]
-        order = np.argsort(-probability, kind="stable")
+        """Detections from the classifier's probabilities (N, 2) for the patches of `prepare`, left to right.
+
+        A glance's word on their places decides with the classifier's which candidates are accepted. Where exactly a
+        line runs the patches tell better.
+        """
+        told = outputs[:, TRUE_LANE].astype(np.float64)
+        probability = _judged(told, prepared)
+        order = np.argsort(-told, kind="stable")
         accepted = order[probability[order] >= self.threshold]
         candidates = [prepared.candidates[i] for i in accepted]
         if not candidates:
             return Findings((), prepared.view, prepared.horizon_weight)
         away = np.abs(_gaps([candidate.curve for candidate in candidates], prepared.view)).max(axis=2)
         chosen = _kept(away > self.same)
-        together = self._together(candidates, probability[accepted], away, chosen, prepared.view)
+        together = self._together(candidates, told[accepted], away, chosen, prepared.view)
         fits = self.refinement.refine(prepared.image, together, prepared.view)
         spans = visible_spans([fit.curve for fit in fits], prepared.view, TOP_SHARE)
         detections = [
@@ -79,12 +84,13 @@ class CandidateDetector:
             for i, fit, span in zip(chosen, fits, spans, strict=True)
             if span is not None
         ]
+        detections.sort(key=lambda detection: -detection.probability)
         return Findings(tuple(self._apart(detections, prepared.view)), prepared.view, prepared.horizon_weight)
 
     def _together(
         self,
         candidates: Sequence[Candidate],
-        probability: NDArray[np.float32],
+        probability: FloatArray,
         away: FloatArray,
         chosen: Sequence[int],
         view: RoadView,
@@ -94,7 +100,7 @@ class CandidateDetector:
         curves = [candidate.curve for candidate in candidates]
         leaning = np.hypot(1.0, [float(curves[i].slope(rows[1])) for i in chosen]) / USUAL_LEANING
         alike = away[chosen] <= self.alike * np.maximum(1.0, leaning)[:, None]
-        weights = alike * probability.astype(np.float64) ** 8
+        weights = alike * probability**8
         columns = weights @ curve_columns(curves, rows) / weights.sum(axis=1, keepdims=True)
         means = curves_through(view.horizon, rows, columns)
         spans = visible_spans(means, view, TOP_SHARE)
@@ -109,6 +115,14 @@ class CandidateDetector:
         on_one_side = (gaps > 0.0).all(axis=2) | (gaps < 0.0).all(axis=2)
         kept = _kept(on_one_side & (np.abs(gaps).min(axis=2) > self.separation))
         return sorted((detections[i] for i in kept), key=lambda d: float(d.curve.x(view.bottom)))
+
+
+def _judged(told: FloatArray, prepared: Prepared) -> FloatArray:
+    """The classifier's probabilities (N,) with what a glance at the frame says of the candidates' places."""
+    if prepared.prior is None:
+        return told
+    odds = prepared.prior.odds([candidate.curve for candidate in prepared.candidates])
+    return told * odds / (1.0 - told + told * odds)
 
 
 def _kept(apart: NDArray[np.bool_]) -> list[int]:

@@ -14,7 +14,7 @@ import numpy as np
 from lanestream.lanes import FloatArray
 
 # Lanes are 2.5 to 4.5 m wide and cameras 1 to 2.4 m high; what is usual stands in where one boundary was seen alone.
-_USUAL: Final = 2.4
+USUAL_WIDTH: Final = 2.4
 _NARROWEST, _WIDEST = 1.2, 4.5
 
 
@@ -36,9 +36,9 @@ class Lattice:
     def of(cls, left: float | None, right: float | None) -> Lattice:
         """The lattice of one or two boundaries; the missing one is a usual lane away."""
         if left is not None:
-            return cls(left, right if right is not None else left + _USUAL)
+            return cls(left, right if right is not None else left + USUAL_WIDTH)
         if right is not None:
-            return cls(right - _USUAL, right)
+            return cls(right - USUAL_WIDTH, right)
         raise ValueError("a lattice needs a boundary")
 
     @property

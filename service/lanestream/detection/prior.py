@@ -1,14 +1,18 @@
-"""A glance at the whole road before lines are looked for: where the regressor sees the ego lane."""
+"""A glance at the whole road before lines are looked for: where the regressor sees the ego lane, and how surely."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from lanestream.detection import Network, Question, Steps
-from lanestream.detection.regression import RegressionDetector, RoadReading
+from lanestream.detection.lattice import USUAL_WIDTH
+from lanestream.detection.regression import ANCHORS, RegressionDetector, RoadReading
 from lanestream.geometry import RoadView
-from lanestream.lanes import Curve, Image
+from lanestream.lanes import Curve, FloatArray, Image, curve_columns
 
 # A boundary whose place is known no better than this, in image widths, leads nowhere: a network that says so has seen
 # a road unlike those it knows.
@@ -16,6 +20,25 @@ _MOST_DOUBT: Final = 0.1
 
 # A horizon farther than this from where it was taken to be, in depths, is worth a second look at the right place.
 _SECOND_LOOK: Final = 0.03
+
+# The shares of the depth at which places are compared: farther away all lines of a road are near one another.
+_COMPARED: Final = np.array(ANCHORS[:2])
+
+# No line is told more exactly than this, in rows below the horizon.
+_EXACT: Final = 0.02
+
+
+@dataclass(frozen=True)
+class SeenBoundary:
+    """An ego boundary that was seen at a glance.
+
+    `curve` is in image pixels; `spread` (2,) are its standard deviations at the compared rows, in rows below the
+    horizon; `presence` is the chance that it is there at all.
+    """
+
+    curve: Curve
+    spread: FloatArray
+    presence: float
 
 
 @dataclass(frozen=True)
@@ -26,13 +49,37 @@ class RoadPrior:
     """
 
     view: RoadView
-    left: Curve | None
-    right: Curve | None
+    left: SeenBoundary | None
+    right: SeenBoundary | None
+
+    @property
+    def seen(self) -> tuple[SeenBoundary, ...]:
+        """The boundaries that were seen, left to right."""
+        return tuple(boundary for boundary in (self.left, self.right) if boundary is not None)
 
     @property
     def curves(self) -> tuple[Curve, ...]:
-        """The boundaries that were seen, left to right."""
-        return tuple(curve for curve in (self.left, self.right) if curve is not None)
+        """Their curves."""
+        return tuple(boundary.curve for boundary in self.seen)
+
+    def odds(self, curves: Sequence[Curve]) -> FloatArray:
+        """How many times likelier (N,) `curves` are boundaries because of where they run: 1 where that tells nothing.
+
+        Elsewhere on a road there is a boundary every lane width. The ego lane has one where each of its own was seen,
+        give or take the spread with the heavy tail of Student's t of three degrees, and none between them.
+        """
+        below = _COMPARED * self.view.depth
+        rows = self.view.horizon + below
+        places = curve_columns(curves, rows) / below
+        away = [(places - boundary.curve.x(rows) / below) / boundary.spread for boundary in self.seen]
+        odds = np.ones(len(curves))
+        if len(away) == 2:
+            within = np.minimum(away[0].mean(axis=1), -away[1].mean(axis=1))
+            odds = 1.0 / (1.0 + np.exp(within.clip(-30.0, 30.0)))
+        for boundary, off in zip(self.seen, away, strict=True):
+            density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (off**2).mean(axis=1) / 3.0) ** 2 / boundary.spread.mean()
+            odds += boundary.presence * USUAL_WIDTH * density
+        return odds
 
 
 @dataclass(frozen=True)
@@ -47,12 +94,15 @@ class RoadGlance:
         reading, seen = yield from self._reading(image, horizon)
         if abs(reading.horizon) > _SECOND_LOOK:
             reading, seen = yield from self._reading(image, seen.horizon)
-        left, right = (reading.curve(side, seen) if self._is_known(reading, side) else None for side in (0, 1))
+        left, right = (self._seen(reading, side, seen) for side in (0, 1))
         return RoadPrior(seen, left, right)
 
-    def _is_known(self, reading: RoadReading, side: int) -> bool:
-        is_there = reading.presence[side] >= self.detector.threshold
-        return bool(is_there and reading.deviations[side].mean() <= _MOST_DOUBT)
+    def _seen(self, reading: RoadReading, side: int, view: RoadView) -> SeenBoundary | None:
+        presence = float(reading.presence[side])
+        if presence < self.detector.threshold or reading.deviations[side].mean() > _MOST_DOUBT:
+            return None
+        spread = np.hypot(reading.deviations[side, : len(_COMPARED)] * view.width / (_COMPARED * view.depth), _EXACT)
+        return SeenBoundary(reading.curve(side, view), spread, presence)
 
     def _reading(self, image: Image, horizon: float | None) -> Steps[tuple[RoadReading, RoadView]]:
         prepared = self.detector.prepare(image, horizon)

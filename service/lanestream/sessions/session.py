@@ -98,7 +98,7 @@ class Session:
             self._tracker = LaneTracker()
             self._estimate, self._evidence = None, 0.0
         self._size = (view.width, view.height)
-        self._glanced = None if prepared.glanced is None else prepared.glanced / view.height
+        self._glanced = None if prepared.prior is None else prepared.prior.view.horizon / view.height
         self._steady_horizon(findings)
         return self._tracker.update(findings.detections, timestamp, findings.view)
 
