@@ -111,6 +111,18 @@ def test_a_coasting_boundary_moves_with_those_that_are_seen() -> None:
     assert right - left == pytest.approx(LANE * VIEW.depth, rel=0.08)
 
 
+def test_a_coasting_boundary_is_not_told_where_the_road_turns_but_keeps_its_id() -> None:
+    tracker = LaneTracker()
+    before = drive(tracker, 12, lambda _: road(0.0, (0, 1)))
+    bends = [180.0 * (i - 11) for i in range(12, 24)]
+    told = [len(tracker.update([detection(-0.5 * LANE, k)], i * DT, VIEW).lanes) for i, k in enumerate(bends, 12)]
+    assert told[0] == 2
+    assert told[-1] == 1
+    after = tracker.update([detection(b, bends[-1]) for b in (-0.5 * LANE, 0.5 * LANE)], 24 * DT, VIEW)
+    assert [lane.track_id for lane in after.lanes] == [lane.track_id for lane in before.lanes]
+    assert [lane.state for lane in after.lanes] == ["detected", "detected"]
+
+
 def test_a_boundary_keeps_its_id_through_a_gap() -> None:
     tracker = LaneTracker()
     both = road(0.0, (0, 1))

@@ -32,6 +32,7 @@ class TrackState:
     side: int
     crossing: int
     detected: bool
+    turned: float = 0.0
 
     @classmethod
     def of(cls, track: Track) -> TrackState:
@@ -49,6 +50,7 @@ class TrackState:
             side=track.side,
             crossing=track.crossing,
             detected=track.detected,
+            turned=track.turned,
         )
 
     def track(self, memory: int) -> Track:
@@ -69,6 +71,7 @@ class TrackState:
             track_id=self.track_id,
             crossing=self.crossing,
             detected=self.detected,
+            turned=self.turned,
         )
 
 

@@ -16,8 +16,8 @@ class Track:
     """A boundary with a past. Times are seconds on the tracker's own clock.
 
     `hits` remembers for the last frames whether a detection backed it. `side` is -1 left and +1 right of the camera;
-    `crossing` counts the frames in which it has been clearly on the other one. `previous_columns` are those of
-    the frame before.
+    `crossing` counts the frames in which it has been clearly on the other one. `turned` tells how much the road has
+    turned beneath it since it was last seen. `previous_columns` are those of the frame before.
     """
 
     kalman: KalmanFilter
@@ -31,6 +31,7 @@ class Track:
     track_id: int | None = None
     crossing: int = 0
     detected: bool = True
+    turned: float = 0.0
     previous_columns: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -52,6 +53,7 @@ class Track:
         self.kalman.update(columns, R=noise)
         self.hits.append(True)
         self.detected = True
+        self.turned = 0.0
         self.last_hit = now
         self.probability += 0.4 * (detection.probability - self.probability)
         self.top += 0.3 * (detection.top - self.top)
@@ -65,6 +67,11 @@ class Track:
         """Notes a frame without a detection."""
         self.hits.append(False)
         self.detected = False
+
+    def carried(self, below: FloatArray) -> None:
+        """Notes that it was moved unseen since the frame before; its rows are `below` (3,) the horizon."""
+        near, middle, _ = (self.columns - self.previous_columns) / below
+        self.turned += abs(float(middle - near))
 
     def move_rows(self, old: Rows, new: Rows) -> None:
         """Tells the state at other rows."""

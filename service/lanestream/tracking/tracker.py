@@ -23,7 +23,9 @@ class TrackerSettings:
 
     Boundaries are followed at the depths `shares`, where they accelerate by about `acceleration` per second squared and
     start with up to `speed` per second. A detection's own covariance is widened by `noise` and by a horizon that nods
-    by `nod`. A track is confirmed by `birth[0]` hits in `birth[1]` frames and coasts for `coast_s` seconds. One that a
+    by `nod`. A track is confirmed by `birth[0]` hits in `birth[1]` frames and coasts for `coast_s` seconds. Where the
+    road turns or the camera nods nobody knows where a coasting boundary is: it is told until the columns that it was
+    moved by at the near and the middle row, each over its rows below the horizon, differ by `turn` in all. One that a
     detection leaves behind by less than `recover` lane widths starts again there. Tracks of one marking, nearer than
     `merge` lane widths, become one.
     """
@@ -35,6 +37,7 @@ class TrackerSettings:
     nod: float = 0.006
     birth: tuple[int, int] = (3, 5)
     coast_s: float = 0.7
+    turn: float = 0.15
     recover: float = 0.3
     merge: float = 0.35
 
@@ -114,7 +117,7 @@ class LaneTracker:
         for i, track in enumerate(self._tracks):
             if i not in matched:
                 track.miss()
-        self._shift_coasting(matched)
+        self._shift_coasting(matched, view)
         taken = {j for _, j in pairs}
         for j, detection in enumerate(detections):
             if j not in taken:
@@ -167,15 +170,14 @@ class LaneTracker:
         noise = (self._settings.noise * view.depth) ** 2 * np.eye(3)
         return columns, covariance + noise + np.outer(nod, nod)
 
-    def _shift_coasting(self, matched: set[int]) -> None:
+    def _shift_coasting(self, matched: set[int], view: RoadView) -> None:
         """Moves unmatched tracks as the matched ones have moved: it was the camera, not the road."""
-        seen = [t for i, t in enumerate(self._tracks) if i in matched and t.confirmed]
-        if not seen:
-            return
-        shift = np.median([track.columns - track.previous_columns for track in seen], axis=0)
+        seen = [t.columns - t.previous_columns for i, t in enumerate(self._tracks) if i in matched and t.confirmed]
         for i, track in enumerate(self._tracks):
             if i not in matched:
-                track.kalman.x[:3] = track.previous_columns + shift
+                if seen:
+                    track.kalman.x[:3] = track.previous_columns + np.median(seen, axis=0)
+                track.carried(self._scaled(self._settings.shares, view))
 
     def _new(self, detection: Detection, columns: FloatArray, noise: FloatArray, view: RoadView) -> Track:
         kalman = boundary_filter(columns, noise, self._scaled(self._settings.speed, view))
@@ -217,7 +219,8 @@ class LaneTracker:
 
     def _result(self, view: RoadView) -> FrameResult:
         assert self._rows is not None  # noqa: S101 - chosen at the start of the update
-        tracks = sorted((t for t in self._tracks if t.confirmed), key=lambda t: float(t.columns[0]))
+        told = (t for t in self._tracks if t.confirmed and t.turned <= self._settings.turn)
+        tracks = sorted(told, key=lambda t: float(t.columns[0]))
         curves = [self._rows.curve(track.columns) for track in tracks]
         columns = [float(curve.x(view.bottom)) for curve in curves]
         lane_width = self._width.value * view.depth
