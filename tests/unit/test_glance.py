@@ -26,11 +26,15 @@ def seen(slope: float, spread: float = 0.05, presence: float = 0.98) -> SeenBoun
 
 
 def test_boundaries_are_likelier_where_they_were_seen_and_hardly_possible_within_the_lane() -> None:
-    odds = RoadPrior(VIEW, seen(-1.2), seen(1.2)).odds([line(b) for b in (-1.2, 1.2, 0.0, 3.6)])
+    odds = RoadPrior(VIEW, seen(-1.2), seen(1.2)).odds([line(b) for b in (-1.2, 1.2, 0.0)])
     assert odds[0] == pytest.approx(odds[1])
     assert odds[0] > 10.0
     assert odds[2] < 0.01
-    assert odds[3] == pytest.approx(1.0, abs=0.01)
+
+
+def test_lanes_repeat_outside_the_ego_lane() -> None:
+    next_lane, between = RoadPrior(VIEW, seen(-1.2), seen(1.2)).odds([line(3.6), line(2.4)])
+    assert next_lane > 1.0 > between
 
 
 def test_a_glance_that_doubts_says_less() -> None:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from lanestream.detection import Network, Question, Steps
-from lanestream.detection.lattice import USUAL_WIDTH
+from lanestream.detection.lattice import USUAL_WIDTH, Lattice
 from lanestream.detection.regression import ANCHORS, RegressionDetector, RoadReading
 from lanestream.geometry import RoadView
 from lanestream.lanes import Curve, FloatArray, Image, curve_columns
@@ -26,6 +26,9 @@ _COMPARED: Final = np.array(ANCHORS[:2])
 
 # No line is told more exactly than this, in rows below the horizon.
 _EXACT: Final = 0.02
+
+# How many times likelier a boundary is a whole lane beside the ego lane than just anywhere outside it.
+_REPEATED: Final = 1.5
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,9 @@ class RoadPrior:
     def odds(self, curves: Sequence[Curve]) -> FloatArray:
         """How many times likelier (N,) `curves` are boundaries because of where they run: 1 where that tells nothing.
 
-        Elsewhere on a road there is a boundary every lane width. The ego lane has one where each of its own was seen,
-        give or take the spread with the heavy tail of Student's t of three degrees, and none between them.
+        Elsewhere on a road there is a boundary every lane width, rather whole lanes away than between. The ego lane has
+        one where each of its own was seen, give or take the spread with the heavy tail of Student's t of three degrees,
+        and none between them.
         """
         below = _COMPARED * self.view.depth
         rows = self.view.horizon + below
@@ -75,7 +79,8 @@ class RoadPrior:
         odds = np.ones(len(curves))
         if len(away) == 2:
             within = np.minimum(away[0].mean(axis=1), -away[1].mean(axis=1))
-            odds = 1.0 / (1.0 + np.exp(within.clip(-30.0, 30.0)))
+            lattice = Lattice(*(float((boundary.curve.x(rows) / below).mean()) for boundary in self.seen))
+            odds = _REPEATED * lattice.trust(places.mean(axis=1)) / (1.0 + np.exp(within.clip(-30.0, 30.0)))
         for boundary, off in zip(self.seen, away, strict=True):
             density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (off**2).mean(axis=1) / 3.0) ** 2 / boundary.spread.mean()
             odds += boundary.presence * USUAL_WIDTH * density
