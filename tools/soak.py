@@ -20,6 +20,7 @@ import click
 import cv2
 import httpx
 import numpy as np
+import psutil
 from demo import service_process
 from soak_camera import FRAME_S, BrokenPromiseError, Camera
 
@@ -36,7 +37,7 @@ _WARM, _ENDS = 1 / 3, 0.15
 
 @dataclass(frozen=True)
 class Vitals:
-    """The service at one moment."""
+    """The service at one moment, with its worker processes."""
 
     seconds: float
     memory_mb: float
@@ -47,14 +48,14 @@ class Vitals:
 
 def vitals(process: int, url: str, seconds: float) -> Vitals:
     """What the system and the service itself say of it."""
-    status = dict(
-        line.split(":\t", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines() if ":\t" in line
-    )
+    service = psutil.Process(process)
+    everything = [service, *service.children(recursive=True)]
     lines = httpx.get(f"{url}/metrics").text.splitlines()
     told = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
-    memory = int(status["VmRSS"].split()[0]) / 1024.0
+    memory = sum(each.memory_info().rss for each in everything) / 2**20
+    threads = sum(each.num_threads() for each in everything)
     sessions, tasks = (int(float(told[name])) for name in ("lane_sessions_active", "lane_tasks"))
-    return Vitals(seconds, memory, int(status["Threads"]), tasks, sessions)
+    return Vitals(seconds, memory, threads, tasks, sessions)
 
 
 def cameras(url: str, count: int, seed: int) -> list[Camera]:

@@ -143,6 +143,12 @@ class LostError(LanestreamError):
     code = "lost"
 
 
+class WorkerLostError(LanestreamError):
+    """The process that worked on a frame has ended, and the frame is lost; the service starts another process."""
+
+    code = "worker_lost"
+
+
 class NotReadyError(LanestreamError):
     """The service has not loaded its network yet."""
 
@@ -221,6 +227,7 @@ _ANSWERS: Final[dict[str, Answer]] = {
     EvictedError.code: Answer(409, 4001),
     IdleError.code: Answer(408, 4002),
     TooOldError.code: Answer(408, 4003),
+    WorkerLostError.code: Answer(503, 1013),
     NotReadyError.code: Answer(503, 1013),
     NotAcceptableError.code: Answer(406, 1003),
 }

@@ -40,9 +40,9 @@ Ground = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ProcessedFrame:
-    """A frame at the end of its way: its picture, and its lanes in pixels of its file, with all stages' timing."""
+    """A frame at the end of its way: the width and height of its file, its lanes in pixels of that, all timing."""
 
-    picture: Picture
+    size: tuple[int, int]
     result: FrameResult
 
     @classmethod
@@ -51,14 +51,14 @@ class ProcessedFrame:
         scaling = picture.scaling
         lanes = tuple(_in_image(lane, scaling) for lane in result.lanes)
         horizon = scaling.to_image(result.horizon)
-        return cls(picture, replace(result, lanes=lanes, horizon=horizon, timing_ms=timing_ms))
+        return cls(picture.size, replace(result, lanes=lanes, horizon=horizon, timing_ms=timing_ms))
 
 
 def lanes_message(
     frame: ProcessedFrame, *, seq: int, timestamp: float, dropped: int = 0, camera: CameraModel | None = None
 ) -> LanesMessage:
     """The message about `frame`; `timestamp` in seconds on the client's clock. With a `camera`, in metres too."""
-    width, height = frame.picture.size
+    width, height = frame.size
     result = frame.result
     grounds = {} if camera is None else _grounds(result, Camera(camera.height, camera.field_of_view), width)
     return LanesMessage(

@@ -85,11 +85,11 @@ class Settings(BaseSettings):
         default=None, description="ONNX file of the second network, or `none`; the shipped one where absent."
     )
     provider: Provider = Field(default="auto", description="Where the networks run.")
-    inference_threads: int = Field(
-        default_factory=network_threads,
+    inference_threads: int | None = Field(
+        default=None,
         ge=1,
         le=256,
-        description="Threads of one network's run on the CPU, by default for half of the processors.",
+        description="Threads of one network's run on the CPU; if absent 1, or half of the processors in one process.",
     )
     tensorrt_cache: Path | None = Field(default=None, description="Folder where TensorRT keeps the engines it builds.")
     max_bytes: int = Field(default=8 << 20, ge=1024, le=1 << 28, description="Bytes of one image file at most.")
@@ -116,8 +116,19 @@ class Settings(BaseSettings):
         default=None,
         description="Redis that keeps sessions for all replicas, redis://host:6379/0; in memory if absent.",
     )
-    threads: Annotated[int, Field(ge=1, le=256, description="Frames in work at a time, a thread each.")] = Field(
-        default_factory=lambda: processors() + 1
+    processes: int | None = Field(
+        default=None,
+        ge=0,
+        le=64,
+        description="Processes that work on frames, 0 for the service's own alone; if absent one for each processor, "
+        "8 at most, and one where a GPU runs the networks.",
+    )
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        le=256,
+        description="Frames that each process has in work at a time, a thread each; if absent 1, or in one process one "
+        "more than there are processors.",
     )
     opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV takes for one image.")
 
@@ -151,7 +162,13 @@ class Settings(BaseSettings):
     @property
     def runtime_options(self) -> RuntimeOptions:
         """How the networks run."""
-        return RuntimeOptions(self.inference_threads, self.tensorrt_cache)
+        # In one process a run leaves room for the frames beside it; among several each has its own processor.
+        usual = network_threads() if self.processes in (0, 1) else 1
+        return RuntimeOptions(self.inference_threads or usual, self.tensorrt_cache)
+
+    def threads_of(self, processes: int) -> int:
+        """Frames in work at a time in each of so many processes."""
+        return self.threads or (1 if processes > 1 else processors() + 1)
 
     @property
     def session_limits(self) -> SessionLimits:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import onnx
 import pytest
+from processes import service
 
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, Engine, chosen_regressor, load_engine
 from lanestream.errors import ModelError, NoDetectorError
@@ -19,7 +20,6 @@ from lanestream.inference import CanvasInfo, RegressorInfo
 from lanestream.inference.model_info import METADATA_KEY
 from lanestream.local import LocalEngine
 from lanestream.protocol import DetectorName, LanesMessage
-from lanestream.runtime import Provider
 from lanestream_client import LaneClient, SourceFrame
 from lanestream_client.in_process import InProcess
 from lanestream_client.service import ServiceInfo
@@ -107,11 +107,17 @@ def test_a_stream_in_process_gives_the_same(real_url: str, real_engine: Engine, 
     assert without_timing(local.detect(drive[0])) == remote[0]
 
 
-@pytest.mark.parametrize("provider", ["cpu", "openvino"])
-def test_interleaved_streams_give_exactly_what_separate_ones_give(
-    serve: Serve, drive: list[bytes], provider: Provider
-) -> None:
-    place = serve(load_engine(None, provider))
+@pytest.fixture(params=["cpu", "openvino", "processes"])
+def place(request: pytest.FixtureRequest, serve: Serve) -> Iterator[str]:
+    """A service whose frames are worked on by threads, of either runtime, or by processes."""
+    if request.param == "processes":
+        with service(processes=2) as (_, url):
+            yield url
+    else:
+        yield serve(load_engine(None, request.param))
+
+
+def test_interleaved_streams_give_exactly_what_separate_ones_give(place: str, drive: list[bytes]) -> None:
     # Each differs from the others in where it begins and in what finds its lanes; their frames meet in the batches.
     drives: list[tuple[list[bytes], DetectorName]] = [
         (drive, "candidates"),

@@ -19,6 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from lanestream.api.metrics import DropReason, Metrics
 from lanestream.inference.batcher import BatchReport
 from lanestream.keys import find, read_keys
+from lanestream.sessions.offers import Offers
 from lanestream.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -127,8 +128,9 @@ def expressions() -> Iterator[str]:
 def exposition() -> str:
     """What a service tells that everything has happened to once."""
     metrics = Metrics()
-    for pipeline in fakes.engine().pipelines:
-        metrics.loaded(pipeline)
+    for offer in Offers.of(fakes.engine().pipelines).all:
+        metrics.loaded(offer)
+    metrics.workers(tuple)
     metrics.frame_processed({"decode": 1.0}, 0.1)
     metrics.batch(BatchReport("fake 1", rows=1, questions=1, still_waiting=0, oldest_s=0.0))
     metrics.socket_closed(1000)

@@ -7,6 +7,7 @@ import pytest
 from lanestream import errors
 from lanestream.api.accept import preferred
 from lanestream.errors import LanestreamError, MissingExtraError, SettingsError, answer_to, error_of, needs_extra
+from lanestream.processors import processors
 from lanestream.protocol import EgoModel, LanesMessage, TimingModel, error_message, schemas
 from lanestream.settings import Settings, load_settings
 from lanestream_client.endpoint import Endpoint
@@ -63,7 +64,7 @@ def test_settings_come_from_the_environment_and_the_command_line(monkeypatch: py
     monkeypatch.setenv("LANESTREAM_MODEL", "")
     settings = load_settings(port=82, host=None)
     assert (settings.port, settings.credits, settings.host, settings.model) == (82, 3, "127.0.0.1", None)
-    assert settings.threads >= 1
+    assert (settings.threads_of(1), settings.threads_of(2)) == (processors() + 1, 1)
     assert settings.image_limits.max_bytes == settings.max_bytes
 
 

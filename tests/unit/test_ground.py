@@ -12,7 +12,6 @@ from pydantic import ValidationError
 
 from lanestream.errors import ProtocolError
 from lanestream.geometry import Camera
-from lanestream.imaging import Picture
 from lanestream.lanes import Curve, EgoLane, FrameResult, LaneBoundary
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.protocol import CameraModel, LanesMessage, StartMessage, parse_client_message, schemas
@@ -54,7 +53,7 @@ def message(
     )
     ego = ego or EgoLane(1 if 1 in sides else None, 2 if 2 in sides else None, 0.0)
     result = FrameResult(lanes, ego, HORIZON, timing_ms=dict.fromkeys(STAGES, 1.0))
-    frame = ProcessedFrame(Picture(np.zeros((HEIGHT, WIDTH, 3), np.uint8)), result)
+    frame = ProcessedFrame((WIDTH, HEIGHT), result)
     return lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
 
 

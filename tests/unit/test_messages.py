@@ -22,7 +22,7 @@ def boundary(curve: Curve, top: float, bottom: float) -> LaneBoundary:
 
 def told(result: FrameResult) -> LanesMessage:
     result = FrameResult(result.lanes, result.ego, result.horizon, result.events, dict.fromkeys(STAGES, 1.23456))
-    frame = ProcessedFrame(Picture(np.zeros((2160, 3840, 3), np.uint8)), result)
+    frame = ProcessedFrame((3840, 2160), result)
     message = parse_server_message(lanes_message(frame, seq=3, timestamp=0.12, dropped=2).model_dump_json())
     assert isinstance(message, LanesMessage)
     return message
@@ -51,7 +51,7 @@ def test_lanes_of_a_reduced_picture_are_told_in_pixels_of_its_file() -> None:
     picture = Picture(np.zeros((360, 640, 3), np.uint8), reduced=2)
     frame = ProcessedFrame.of(picture, result, dict.fromkeys(STAGES, 1.0))
     (moved,) = frame.result.lanes
-    assert (frame.picture.size, frame.result.horizon, moved.top, moved.bottom) == ((1280, 720), 200.5, 240.5, 718.5)
+    assert (frame.size, frame.result.horizon, moved.top, moved.bottom) == ((1280, 720), 200.5, 240.5, 718.5)
     for row in (130.0, 200.0, 359.0):
         assert moved.curve.x(2.0 * row + 0.5) == pytest.approx(2.0 * float(lane.curve.x(row)) + 0.5, abs=1e-9)
         # What is known to a pixel of the reduced picture is known to two of the file.

@@ -15,7 +15,8 @@ from lanestream.engine import Engine
 from lanestream.imaging import ImageLimits
 from lanestream.lanes import Image
 from lanestream.messages import ProcessedFrame
-from lanestream.sessions.runner import EncodedFrame, FrameRunner
+from lanestream.sessions.thread_runner import ThreadRunner
+from lanestream.sessions.worker import EncodedFrame
 
 
 class Counting(fakes.FakeNetwork):
@@ -48,9 +49,9 @@ def run_together(network: Counting, threads: int, cameras: int) -> list[Processe
     frame = EncodedFrame(fakes.image_file(), 0.0, 0.0)
 
     async def run() -> list[ProcessedFrame]:
-        runner = FrameRunner(ImageLimits(), threads)
-        frames = await asyncio.gather(*(runner.run(engine.open_session(), frame) for _ in range(cameras)))
-        runner.close()
+        runner = ThreadRunner(engine, ImageLimits(), threads)
+        frames = await asyncio.gather(*(runner.run(runner.open_camera(), frame) for _ in range(cameras)))
+        await runner.close()
         return frames
 
     return asyncio.run(run())

@@ -10,15 +10,17 @@ import pytest
 
 from lanestream.detection import answered
 from lanestream.errors import BusyError, NoDetectorError, StoreError
+from lanestream.imaging import ImageLimits
 from lanestream.lanes import FrameResult
 from lanestream.protocol import StartMessage
 from lanestream.sessions.caller import Caller
 from lanestream.sessions.manager import OpenSession, SessionLimits, SessionManager
 from lanestream.sessions.session import Session
 from lanestream.sessions.store import Entry, MemoryStore
+from lanestream.sessions.thread_runner import ThreadRunner
 
 ANN, BOB = Caller("ann", "ann"), Caller("bob", "bob")
-ENGINE = fakes.engine()
+RUNNER = ThreadRunner(fakes.engine(), ImageLimits(), threads=1)
 
 
 @dataclass
@@ -53,12 +55,13 @@ def manager(store: MemoryStore | None = None, clock: Clock | None = None, **limi
     return SessionManager(SessionLimits(**limits), store or MemoryStore(), clock or Clock())  # type: ignore[arg-type]
 
 
-def follow(session: Session, timestamp: float) -> FrameResult:
-    return answered(session.follow(fakes.picture(), timestamp))
+def follow(opened: OpenSession, timestamp: float) -> FrameResult:
+    assert isinstance(opened.camera, Session)
+    return answered(opened.camera.follow(fakes.picture(), timestamp))
 
 
 async def started(sessions: SessionManager, caller: Caller = ANN, token: str | None = None) -> OpenSession:
-    return await sessions.start(ENGINE, caller, StartMessage(resume_token=token))
+    return await sessions.start(RUNNER, caller, StartMessage(resume_token=token))
 
 
 async def test_a_session_goes_on_where_it_was_on_another_replica() -> None:
@@ -66,18 +69,18 @@ async def test_a_session_goes_on_where_it_was_on_another_replica() -> None:
     here, there = manager(store, clock), manager(store, clock)
     first = await started(here)
     for i in range(10):
-        before = follow(first.session, 0.1 * i)
+        before = follow(first, 0.1 * i)
     first.last_seq, first.stream_s = 9, 3.5
     await here.close(first, for_good=False)
     clock.now += 20.0
     second = await started(there, token=first.token)
     assert (second.resumption, second.id, second.token) == ("resumed", first.id, first.token)
     assert (second.last_seq, second.stream_s, second.born) == (9, 23.5, first.born)
-    assert second.session.state == first.session.state
-    after = follow(second.session, 1.0)
+    assert second.camera.state == first.camera.state
+    after = follow(second, 1.0)
     assert [lane.track_id for lane in after.lanes] == [lane.track_id for lane in before.lanes] == [1, 2]
-    follow(first.session, 1.0)
-    assert second.session.state == first.session.state, "to the last digit"
+    follow(first, 1.0)
+    assert second.camera.state == first.camera.state, "to the last digit"
     assert [lane.age_s for lane in after.lanes] == [1.0, 1.0]
 
 
@@ -85,12 +88,12 @@ async def test_of_a_lost_replica_the_ids_that_it_may_have_given_are_not_given_ag
     store = MemoryStore()
     lost, other = manager(store), manager(store)
     first = await started(lost)
-    follow(first.session, 0.0)
+    follow(first, 0.0)
     lost.note(first)
     await asyncio.sleep(0.3)
     second = await started(other, token=first.token)
     assert second.resumption == "resumed"
-    before, after = first.session.state.tracker, second.session.state.tracker
+    before, after = first.camera.state.tracker, second.camera.state.tracker
     assert after.tracks == before.tracks
     assert after.next_id > before.next_id
 
@@ -183,7 +186,7 @@ async def test_the_last_change_is_saved_when_nothing_follows_it() -> None:
 async def test_limits_count_sessions_in_all_and_by_caller() -> None:
     sessions = manager(sessions=3, sessions_per_caller=2)
     first = await started(sessions)
-    with sessions.opened(ENGINE, ANN), pytest.raises(BusyError, match="2 sessions, which is the most for one"):
+    with sessions.opened(RUNNER, ANN), pytest.raises(BusyError, match="2 sessions, which is the most for one"):
         await started(sessions)
     await started(sessions, BOB)
     await started(sessions)
@@ -196,7 +199,7 @@ async def test_limits_count_sessions_in_all_and_by_caller() -> None:
 async def test_a_detector_that_is_not_there_takes_no_place() -> None:
     sessions = manager(sessions=1)
     with pytest.raises(NoDetectorError):
-        await sessions.start(ENGINE, ANN, StartMessage(detector="regression"))
+        await sessions.start(RUNNER, ANN, StartMessage(detector="regression"))
     await started(sessions)
 
 
@@ -223,7 +226,7 @@ async def test_a_small_state_is_kept() -> None:
     store = MemoryStore()
     opened = await started(manager(store))
     for i in range(30):
-        follow(opened.session, 0.1 * i)
+        follow(opened, 0.1 * i)
     sessions = manager(store)
     await sessions.close(opened, for_good=False)
     assert opened.key is not None

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.inprocess import Hello
 from bench.measuring import Sample
-from bench.plan import LARGE, LITSERVE, LOOP, NAIVE, PIPELINE, SERVICE, Cell, Plan, Size
+from bench.plan import LARGE, LITSERVE, LOOP, NAIVE, PIPELINE, POOL, SERVICE, Cell, Plan, Size
 from bench.running import Overload, Results, compared
 
 _PACKAGES: Final = (
@@ -44,6 +44,7 @@ def figures(results: Results, plan: Plan, hello: Hello, frames: str) -> dict[str
         "soak": None if results.soak is None else _soak(results.soak, results.memory_before_soak_mb),
         "model": hello.model,
         "provider": hello.provider,
+        "processes": hello.processes,
         "threads": hello.threads,
         "candidates_per_frame": round(hello.patches, 2),
         "frames": frames,
@@ -84,8 +85,11 @@ def _ratios(results: Results, plan: Plan, size: Size) -> dict[str, Any]:
     def service(cells: Round) -> float:
         return rate(cells, SERVICE)
 
+    def in_process(cells: Round) -> float:
+        return max(rate(cells, name) for name in (PIPELINE, LOOP, POOL))
+
     return {
-        "service_over_inprocess": ratio(service, lambda cells: max(rate(cells, PIPELINE), rate(cells, LOOP))),
+        "service_over_inprocess": ratio(service, in_process),
         f"at_{many}_over_at_{few}": ratio(lambda cells: rate(cells, SERVICE, many), service),
         "over_naive": ratio(service, lambda cells: rate(cells, NAIVE)),
         "over_litserve": ratio(service, lambda cells: rate(cells, LITSERVE)),

@@ -9,26 +9,37 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from multiprocessing.connection import Connection
 
 import cv2
 
 from bench.frames import FPS, Clips, to_and_fro
-from bench.orders import Answer, Order, Tally
+from bench.orders import Answer, Kind, Order, Tally
 from lanestream.detection import in_one
 from lanestream.engine import Engine, load_engine
 from lanestream.imaging import ImageLimits, decode
 from lanestream.local import LocalCamera, LocalEngine
+from lanestream.logs import log_config
 from lanestream.runtime import Provider
-from lanestream.sessions.runner import EncodedFrame, FrameRunner
-from lanestream.settings import Settings, load_settings
+from lanestream.sessions.offers import Offers
+from lanestream.sessions.parcels import Setup
+from lanestream.sessions.process_runner import ProcessRunner, usual_processes
+from lanestream.sessions.runner import FrameRunner
+from lanestream.sessions.thread_runner import ThreadRunner
+from lanestream.sessions.worker import EncodedFrame
+from lanestream.settings import load_settings
 
 
 @dataclass(frozen=True)
 class Hello:
-    """What the pipeline tells of itself: its threads, its network, and patches a frame of the largest size."""
+    """What the pipeline tells of itself.
 
+    The service's processes and their threads, the network, and patches a frame of the largest size.
+    """
+
+    processes: int
     threads: int
     model: str
     provider: str
@@ -40,14 +51,25 @@ def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     settings = load_settings()
     cv2.setNumThreads(settings.opencv_threads)
-    engine = load_engine(provider=provider, options=settings.runtime_options)
+    load = partial(load_engine, provider=provider, options=settings.runtime_options)
+    engine = load()
+    processes = settings.processes or usual_processes(Offers.of(engine.pipelines))
+    threads = processes * settings.threads_of(processes)
     network = engine.network
-    pipe.send(Hello(settings.threads, network.name, network.provider, patches_per_frame(engine, clips[max(clips)])))
-    while True:
-        order: Order = pipe.recv()
-        cameras = Cameras(engine, order, clips[order.size], settings)
-        with ThreadPoolExecutor(1) as worker:
-            working = worker.submit(cameras.loop if order.kind == "loop" else cameras.run)
+    patches = patches_per_frame(engine, clips[max(clips)])
+    with ThreadPoolExecutor(1) as worker, asyncio.Runner() as loop:
+        setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
+        runners: dict[Kind, FrameRunner] = {
+            "pipeline": ThreadRunner(engine, settings.image_limits, threads),
+            "pool": worker.submit(loop.run, ProcessRunner.started(setup, processes, settings.threads_of)).result(),
+        }
+        pipe.send(Hello(processes, threads // processes, network.name, network.provider, patches))
+        while True:
+            order: Order = pipe.recv()
+            cameras = Cameras(engine, order, clips[order.size], threads)
+            runner = runners.get(order.kind)
+            step = cameras.loop if runner is None else partial(loop.run, cameras.run(runner))
+            working = worker.submit(step)
             while not pipe.poll(0.02):
                 if cameras.settled:
                     pipe.send(None)
@@ -55,7 +77,7 @@ def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
             pipe.recv()
             cameras.stopped.set()
             error = working.exception()
-        pipe.send(cameras.tally if error is None else f"the pipeline in process failed: {error!r}")
+            pipe.send(cameras.tally if error is None else f"the pipeline in process failed: {error!r}")
 
 
 def patches_per_frame(engine: Engine, jpegs: Sequence[bytes]) -> float:
@@ -81,7 +103,7 @@ class Cameras:
     engine: Engine
     order: Order
     jpegs: Sequence[bytes]
-    settings: Settings
+    threads: int
     tally: Tally = field(default_factory=Tally)
     stopped: threading.Event = field(default_factory=threading.Event)
     _answered: set[int] = field(default_factory=set)
@@ -91,35 +113,30 @@ class Cameras:
         """Whether every camera had an answer."""
         return len(self._answered) == self.order.sessions
 
-    def run(self) -> None:
-        """As the service runs it: its pool of threads, its inference thread and its batches, nothing of the network."""
-        asyncio.run(self._run())
-
     def loop(self) -> None:
         """As a script would: every thread takes the frames of its cameras one after the other, from end to end."""
-        local, threads = LocalEngine(self.engine), self.settings.threads
+        local, threads = LocalEngine(self.engine), self.threads
         cameras = [(number, local.open_camera(detector=self.order.detector)) for number in range(self.order.sessions)]
         with ThreadPoolExecutor(threads) as workers:
             list(workers.map(self._loop, [cameras[thread::threads] for thread in range(min(threads, len(cameras)))]))
 
-    async def _run(self) -> None:
-        runner = FrameRunner(self.settings.image_limits, self.settings.threads)
+    async def run(self, runner: FrameRunner) -> None:
+        """As a service runs it: its threads or processes and its batches, nothing of the network."""
         cameras = [asyncio.create_task(self._follow(runner, number)) for number in range(self.order.sessions)]
         stopped = asyncio.create_task(asyncio.to_thread(self.stopped.wait))
         done, _ = await asyncio.wait({stopped, *cameras}, return_when=asyncio.FIRST_COMPLETED)
         for camera in cameras:
             camera.cancel()
         await asyncio.wait(cameras)
-        runner.close()
         self.stopped.set()
         await asyncio.gather(*done)
 
     async def _follow(self, runner: FrameRunner, number: int) -> None:
-        session, seq = self.engine.open_session(detector=self.order.detector), 0
+        camera, seq = runner.open_camera(detector=self.order.detector), 0
         while True:
             started = time.monotonic()
             async with runner.turn():
-                await runner.run(session, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
+                await runner.run(camera, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
             self._note(number, started)
             seq += 1
 

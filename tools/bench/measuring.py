@@ -16,7 +16,7 @@ from bench.frames import Clips
 from bench.inprocess import Hello, run_pipeline
 from bench.load import generate
 from bench.orders import Answer, Helper, Kind, Order
-from bench.plan import LOOP, PIPELINE, Cell
+from bench.plan import LOOP, PIPELINE, POOL, Cell
 from lanestream.runtime import Provider
 
 # Two load generators, so that a burst of answers for many sessions does not wait for one.
@@ -24,10 +24,11 @@ GENERATORS: Final = 2
 SETTLE_S: Final = 15.0
 # The clock runs for so many times as long as it took until every session had an answer, if that is longer than planned.
 CYCLES: Final = 2.5
-# Answers of one session that come within so many seconds are those of one batch.
+# Answers that come within so many seconds are those of one batch.
 BATCH_S: Final = 0.01
 # With more frames in flight than this, a server that answers those who have left is started anew for the next cell.
 CROWD: Final = 8
+_IN_PROCESS: Final[dict[str, Kind]] = {PIPELINE: "pipeline", LOOP: "loop", POOL: "pool"}
 
 
 @dataclass(frozen=True)
@@ -49,18 +50,13 @@ class Sample:
 
     @property
     def fps(self) -> float:
-        """Answers a second: the sum of what each session had after its first ones, until its last one.
+        """Answers a second, from the first ones to the last one.
 
-        Answers come in bursts, of many sessions or of a batch, so that a count would depend on where the seconds begin.
-        Where some sessions had none before the clock started, the few that others had tell no rate: they are counted.
+        Answers come in batches, so that a count would depend on where the seconds begin. Where some sessions had none
+        before the clock started, the few that others had tell no rate: they are counted.
         """
-        ends: dict[int, list[float]] = {}
-        for answer in self.answers:
-            ends.setdefault(answer.session, []).append(answer.answered)
-        rates = [_rate(sorted(times)) for times in ends.values()]
-        if not self.settled or None in rates:
-            return len(self.answers) / self.seconds
-        return sum(rate for rate in rates if rate is not None)
+        rate = _rate(sorted(answer.answered for answer in self.answers)) if self.settled else None
+        return len(self.answers) / self.seconds if rate is None else rate
 
     @property
     def milliseconds(self) -> list[float]:
@@ -90,8 +86,8 @@ class Bench:
 
     def load(self, contestant: str, order: Order, seconds: float) -> Sample:
         """`order` for so many seconds on a contestant. Raises RuntimeError where a stream breaks."""
-        if contestant in (PIPELINE, LOOP):
-            kind: Kind = "loop" if contestant == LOOP else "pipeline"
+        if contestant in _IN_PROCESS:
+            kind = _IN_PROCESS[contestant]
             with _running(self._watched) as watched:
                 return self._loaded(watched, [(self._pipeline, replace(order, kind=kind))], seconds)
         server = self.servers[contestant]
@@ -137,6 +133,8 @@ def _running(watched: Watched) -> Iterator[Watched]:
 
 def _rate(times: Sequence[float]) -> float | None:
     """Answers a second after those that came together with the first one; None where there are no others."""
+    if not times:
+        return None
     together = sum(time <= times[0] + BATCH_S for time in times)
     return (len(times) - together) / (times[-1] - times[together - 1]) if together < len(times) else None
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from bench.plan import Size
 from lanestream.protocol import DetectorName
 
-Kind = Literal["lanestream", "bare", "http", "pipeline", "loop"]
+Kind = Literal["lanestream", "bare", "http", "pipeline", "loop", "pool"]
 
 
 @dataclass(frozen=True)

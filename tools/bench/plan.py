@@ -12,10 +12,11 @@ Size = tuple[int, int]
 LARGE: Final[Size] = (1280, 720)
 SMALL: Final[Size] = (640, 360)
 
-# The pipeline in process, run as the service runs it, and run by a plain loop in each thread.
-PIPELINE, LOOP = "pipeline", "loop"
+# The pipeline in one process, run as a service of one would run it, and by a plain loop in each thread; and in as many
+# processes as the service has.
+PIPELINE, LOOP, POOL = "pipeline", "loop", "pool"
 SERVICE, NAIVE, LITSERVE = "service", "naive", "litserve"
-CONTESTANTS: Final = (PIPELINE, LOOP, SERVICE, NAIVE, LITSERVE)
+CONTESTANTS: Final = (PIPELINE, LOOP, POOL, SERVICE, NAIVE, LITSERVE)
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Plan:
             Cell(name, size, sessions, 2, self._seconds(name, size))
             for sessions in self.sessions
             for name in CONTESTANTS
-            if sessions <= self.few or (number == 0 and name != LOOP) or name in (PIPELINE, SERVICE)
+            if sessions <= self.few or (number == 0 and name not in (LOOP, POOL)) or name in (PIPELINE, SERVICE)
         ]
 
     def _seconds(self, name: str, size: Size) -> float:

@@ -20,6 +20,7 @@ from lanestream.api.problems import Problem, problem_of, problem_response
 from lanestream.api.service import Draw, Service
 from lanestream.errors import LanestreamError, ProtocolError, one_line
 from lanestream.protocol import error_message
+from lanestream.sessions.thread_runner import ThreadRunner
 
 if TYPE_CHECKING:
     from lanestream.engine import Engine
@@ -27,15 +28,16 @@ if TYPE_CHECKING:
 
 
 def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = None) -> FastAPI:
-    """The application around a warm `engine`.
+    """The application around a warm `engine`, whose frames are worked on in threads of this process.
 
-    Without an engine it lives but is not ready until `app.state.service.install(engine)`. `draw` paints the lanes of a
+    Without an engine it lives but is not ready until `app.state.service.install(runner)`. `draw` paints the lanes of a
     message on a BGR image (H, W, 3) uint8; without it pictures are refused. Raises SettingsError where the file of API
     keys can't be used.
     """
     service = Service(settings, draw)
     if engine is not None:
-        service.install(engine)
+        threads = settings.threads_of(1)
+        service.install(ThreadRunner(engine, settings.image_limits, threads, service.metrics.batch))
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:

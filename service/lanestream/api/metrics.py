@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, PlatformCollector, ProcessCollector
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
+from lanestream.api.worker_metrics import WorkerCollector
 from lanestream.errors import (
     BusyError,
     DrainingError,
@@ -20,8 +21,8 @@ from lanestream.errors import (
 )
 
 if TYPE_CHECKING:
-    from lanestream.detection import Pipeline
     from lanestream.inference.batcher import BatchReport
+    from lanestream.sessions.offers import Offer
 
 DropReason = Literal["superseded", "expired", "overload", "decode_error", "too_large", "rate", "disconnected", "error"]
 ResumeResult = Literal["resumed", "unknown", "refused"]
@@ -137,14 +138,18 @@ class Metrics:
         """A client was told an error of this code."""
         self._refusals.labels(code).inc()
 
-    def loaded(self, pipeline: Pipeline) -> None:
+    def loaded(self, offer: Offer) -> None:
         """A detector is ready, with a network."""
-        network = pipeline.network
+        network = offer.network
         device = "gpu" if network.provider in _ON_GPU else "cpu"
         told = network.metadata
         self._provider.labels(network.name, network.provider, device, told.get("precision", "unknown")).set(1)
         self._fallback.labels(network.name).set(network.fell_back)
         self._model.labels(told.get("name", network.name), told.get("version", "unknown"), network.sha256).set(1)
+
+    def workers(self, pids: Callable[[], Sequence[int]]) -> None:
+        """There may be worker processes; `pids` tells their numbers."""
+        self._registry.register(WorkerCollector(pids))
 
     def exposition(self) -> bytes:
         """All of it in Prometheus' text format, of the type `MEDIA_TYPE`."""

@@ -16,16 +16,17 @@ from lanestream.api.problems import Problem
 from lanestream.api.service import Service
 from lanestream.asyncapi import document
 from lanestream.errors import NotAcceptableError, one_line
+from lanestream.imaging import decode
 from lanestream.messages import lanes_message
 from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
 from lanestream.sessions.caller import Caller
-from lanestream.sessions.runner import EncodedFrame
+from lanestream.sessions.worker import EncodedFrame
 
 if TYPE_CHECKING:
     from lanestream.api.service import Draw
-    from lanestream.detection import Pipeline
     from lanestream.messages import ProcessedFrame
     from lanestream.sessions.manager import OpenSession
+    from lanestream.sessions.offers import Offer
 
 # For everybody: whether the service lives, and what its own repository tells as well.
 open_router = APIRouter()
@@ -48,9 +49,9 @@ class NetworkEntry(BaseModel):
     provider: str
 
     @classmethod
-    def of(cls, pipeline: Pipeline, **more: Any) -> Self:
-        """The entry of a pipeline's network, with the fields `more`."""
-        return cls(name=pipeline.network.name, detector=pipeline.name, provider=pipeline.network.provider, **more)
+    def of(cls, offer: Offer, **more: Any) -> Self:
+        """The entry of an offer's network, with the fields `more`."""
+        return cls(name=offer.network.name, detector=offer.detector, provider=offer.network.provider, **more)
 
 
 class ModelEntry(NetworkEntry):
@@ -60,9 +61,9 @@ class ModelEntry(NetworkEntry):
     metadata: dict[str, Any]
 
     @classmethod
-    def about(cls, pipeline: Pipeline) -> Self:
-        """The entry of a pipeline's network."""
-        return cls.of(pipeline, sha256=pipeline.network.sha256, metadata=dict(pipeline.network.metadata))
+    def about(cls, offer: Offer) -> Self:
+        """The entry of an offer's network."""
+        return cls.of(offer, sha256=offer.network.sha256, metadata=dict(offer.network.metadata))
 
 
 class ModelList(BaseModel):
@@ -138,26 +139,25 @@ async def detect(
     """The lanes of one image, sent as the body or as the file of a form; as JSON, or drawn on it by `Accept`."""
     service = _service(request)
     service.check_open()
-    loaded = service.loaded
+    runner = service.runner
     form = _answer_form(request, service.draw)
     # What is refused anyway is refused before its body is read; what is read slowly holds no session meanwhile.
-    loaded.engine.pipeline(detector)
+    runner.offers.chosen(detector)
     service.sessions.check_limits(caller)
     data = await service.bodies.image_file(request)
-    with service.sessions.opened(loaded.engine, caller, horizon, detector) as opened:
-        frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic(), whole=form != _JSON))
+    with service.sessions.opened(runner, caller, horizon, detector) as opened:
+        frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic()))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
-    if form == _JSON or service.draw is None:
+    if form == _JSON:
         return Response(message.model_dump_json(), media_type=_JSON)
-    picture = await loaded.runner.work(_picture, service.draw, frame, message, form)
+    picture = await runner.work(_picture, service, data, message, form)
     return Response(picture, media_type=form)
 
 
 @router.get("/v1/models", responses={503: _PROBLEMS[503]})
 async def models(request: Request) -> ModelList:
     """The networks that are loaded, the default detector's first, and what really runs them."""
-    pipelines = _service(request).loaded.engine.pipelines
-    return ModelList(models=[ModelEntry.about(pipeline) for pipeline in pipelines])
+    return ModelList(models=[ModelEntry.about(offer) for offer in _service(request).runner.offers.all])
 
 
 @open_router.get("/v1/schema")
@@ -182,7 +182,7 @@ async def healthz() -> dict[str, str]:
 async def readyz(request: Request) -> Readiness:
     """Answers once the networks are loaded and warm, until the service is about to stop."""
     _service(request).check_open()
-    networks = [NetworkEntry.of(pipeline) for pipeline in _service(request).loaded.engine.pipelines]
+    networks = [NetworkEntry.of(offer) for offer in _service(request).runner.offers.all]
     return Readiness(status="ready", provider=networks[0].provider, networks=networks)
 
 
@@ -198,9 +198,8 @@ async def _processed(service: Service, opened: OpenSession, image: EncodedFrame)
     """The lanes of an image, counted whether they are found or not."""
     service.metrics.frame_received()
     try:
-        runner = service.loaded.runner
-        async with runner.turn():
-            frame = await runner.run(opened.session, image)
+        async with service.runner.turn():
+            frame = await service.runner.run(opened.camera, image)
     except BaseException as error:
         service.metrics.frame_failed(error)
         raise
@@ -223,6 +222,8 @@ def _answer_form(request: Request, draw: Draw | None) -> str:
     return form
 
 
-def _picture(draw: Draw, frame: ProcessedFrame, message: LanesMessage, form: str) -> bytes:
-    _, encoded = cv2.imencode(_PICTURES[form], draw(frame.picture.image, message))
+def _picture(service: Service, data: bytes, message: LanesMessage, form: str) -> bytes:
+    assert service.draw is not None  # noqa: S101 - else there would be no such form
+    image = decode(data, service.settings.image_limits)
+    _, encoded = cv2.imencode(_PICTURES[form], service.draw(image, message))
     return encoded.tobytes()

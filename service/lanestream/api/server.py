@@ -18,12 +18,16 @@ from lanestream.api.access import warn_if_open
 from lanestream.api.app import create_app
 from lanestream.errors import SettingsError
 from lanestream.logs import log_config
+from lanestream.sessions.parcels import Setup
+from lanestream.sessions.process_runner import ProcessRunner
+from lanestream.sessions.thread_runner import ThreadRunner
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from lanestream.api.service import Draw, Service
     from lanestream.engine import Engine
+    from lanestream.sessions.runner import FrameRunner
     from lanestream.settings import Settings
 
 _log = logging.getLogger(__name__)
@@ -31,7 +35,8 @@ _BACKLOG: Final = 2048
 
 
 def serve(settings: Settings, load: Callable[[], Engine], draw: Draw | None = None) -> None:
-    """Serves until a signal ends it; `load` returns a warm engine and is called in a thread while the service lives.
+    """Serves until a signal ends it; `load` returns a warm engine; it is called while the service lives, in
+    a thread or in worker processes, which have to be able to import it.
 
     Raises SettingsError where it can't listen, and what `load` raises.
     """
@@ -87,13 +92,23 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
     warn_if_open(app.state.service.gatekeeper, host, loopback=ipaddress.ip_address(host).is_loopback)
     _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
     try:
-        engine = await asyncio.to_thread(load)
-        app.state.service.install(engine)
-        for name, network in ((pipeline.name, pipeline.network) for pipeline in engine.pipelines):
-            _log.info("detector %s: %s on %s (%s)", name, network.name, network.provider, network.reason)
+        runner = await _runner(app.state.service, load)
+        app.state.service.install(runner)
+        for offer in runner.offers.all:
+            network = offer.network
+            _log.info("detector %s: %s on %s (%s)", offer.detector, network.name, network.provider, network.reason)
         _log.info("ready")
     except BaseException:
         server.should_exit = True
         await serving
         raise
     await serving
+
+
+async def _runner(service: Service, load: Callable[[], Engine]) -> FrameRunner:
+    """What works on frames, warm: worker processes, or threads of this one where the settings say so."""
+    settings, observe = service.settings, service.metrics.batch
+    if settings.processes == 0:
+        return ThreadRunner(await asyncio.to_thread(load), settings.image_limits, settings.threads_of(1), observe)
+    setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
+    return await ProcessRunner.started(setup, settings.processes, settings.threads_of, observe)

@@ -1,11 +1,10 @@
-"""What all requests of a process share: its settings, its engine once that is loaded, its threads and its sessions."""
+"""What all requests of a process share: its settings, what works on frames once that is ready, and its sessions."""
 
 from __future__ import annotations
 
 import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lanestream.api.access import Gatekeeper
@@ -14,14 +13,13 @@ from lanestream.api.metrics import Metrics
 from lanestream.errors import DrainingError, NotReadyError
 from lanestream.protocol import Limits
 from lanestream.sessions.manager import SessionManager
-from lanestream.sessions.runner import FrameRunner
 from lanestream.sessions.store import MemoryStore, SessionStore
 
 if TYPE_CHECKING:
     from lanestream.api.stream import StreamHandler
-    from lanestream.engine import Engine
     from lanestream.lanes import Image
     from lanestream.protocol import LanesMessage
+    from lanestream.sessions.runner import FrameRunner
     from lanestream.settings import Settings
 
 Draw = Callable[["Image", "LanesMessage"], "Image"]
@@ -29,16 +27,8 @@ Draw = Callable[["Image", "LanesMessage"], "Image"]
 _DRAIN_STEP_S: Final = 0.02
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """A warm engine and the threads that it runs in."""
-
-    engine: Engine
-    runner: FrameRunner
-
-
 class Service:
-    """The state of the application. Begins without an engine, because loading one takes seconds.
+    """The state of the application. Begins without a runner, because loading networks takes seconds.
 
     `draw` paints lanes on an image for those who ask for a picture; None where the process can't draw.
     """
@@ -53,14 +43,14 @@ class Service:
         self.draining = False
         self._store = _store(settings)
         self.sessions = SessionManager(settings.session_limits, self._store)
-        self._loaded: Loaded | None = None
+        self._runner: FrameRunner | None = None
 
     @property
-    def loaded(self) -> Loaded:
-        """The engine and its threads. Raises NotReadyError before `install`."""
-        if self._loaded is None:
+    def runner(self) -> FrameRunner:
+        """What works on frames. Raises NotReadyError before `install`."""
+        if self._runner is None:
             raise NotReadyError("the networks are still being loaded", "ask /readyz, try again in a moment")
-        return self._loaded
+        return self._runner
 
     @property
     def limits(self) -> Limits:
@@ -68,18 +58,18 @@ class Service:
         return Limits.model_validate(self.settings, from_attributes=True)
 
     def check_open(self) -> None:
-        """Raises NotReadyError before there is an engine, and DrainingError where nothing new is taken any more."""
+        """Raises NotReadyError where no frame can be worked on, DrainingError where nothing new is taken any more."""
         if self.draining:
             raise DrainingError("the service is about to stop", "ask another replica, or again in a moment")
-        _ = self.loaded
+        if not self.runner.works:
+            raise NotReadyError("the worker processes are being started again", "ask /readyz, try again in a moment")
 
-    def install(self, engine: Engine) -> None:
-        """Makes the service ready with a warm engine."""
-        settings = self.settings
-        runner = FrameRunner(settings.image_limits, settings.threads, self.metrics.batch)
-        for pipeline in engine.pipelines:
-            self.metrics.loaded(pipeline)
-        self._loaded = Loaded(engine, runner)
+    def install(self, runner: FrameRunner) -> None:
+        """Makes the service ready with a warm runner."""
+        for offer in runner.offers.all:
+            self.metrics.loaded(offer)
+        self.metrics.workers(lambda: runner.pids)
+        self._runner = runner
 
     async def drain(self) -> None:
         """Takes nothing new, tells the streams, and waits until all frames that came before are answered.
@@ -94,11 +84,11 @@ class Service:
             await asyncio.sleep(_DRAIN_STEP_S)
 
     async def close(self) -> None:
-        """Stops being ready and ends the threads after what they are at."""
-        loaded, self._loaded = self._loaded, None
+        """Stops being ready and ends threads and processes after what they are at."""
+        runner, self._runner = self._runner, None
         await self._store.close()
-        if loaded is not None:
-            await asyncio.to_thread(loaded.runner.close)
+        if runner is not None:
+            await runner.close()
 
 
 def _store(settings: Settings) -> SessionStore:

@@ -35,15 +35,15 @@ from lanestream.protocol import (
     error_message,
     parse_client_message,
 )
-from lanestream.sessions.runner import EncodedFrame
 from lanestream.sessions.stream_rules import Outcome, StreamRules, check_age
+from lanestream.sessions.worker import EncodedFrame
 
 if TYPE_CHECKING:
     from lanestream.api.service import Service
-    from lanestream.detection import Pipeline
     from lanestream.messages import ProcessedFrame
     from lanestream.sessions.caller import Caller
     from lanestream.sessions.manager import OpenSession
+    from lanestream.sessions.offers import Offer
     from lanestream.sessions.stream_rules import IncomingFrame
 
 router = APIRouter()
@@ -132,10 +132,10 @@ class StreamHandler:
         message = parse_client_message(text)
         if isinstance(message, StartMessage):
             # First of all, because a detector that is not there leaves the stream as it was.
-            pipeline = self._service.loaded.engine.pipeline(message.detector)
+            offer = self._service.runner.offers.chosen(message.detector)
             self._service.check_open()
             self._rules.start(message, now)
-            await self._start(message, pipeline)
+            await self._start(message, offer)
         elif isinstance(message, FrameMessage):
             self._rules.announce(message, now)
         elif isinstance(message, EndMessage):
@@ -154,19 +154,19 @@ class StreamHandler:
         if not self._rules.over:
             self._ensure_session()
 
-    async def _start(self, message: StartMessage, pipeline: Pipeline) -> None:
-        opened = await self._service.sessions.start(self._service.loaded.engine, self._caller, message)
+    async def _start(self, message: StartMessage, offer: Offer) -> None:
+        opened = await self._service.sessions.start(self._service.runner, self._caller, message)
         self._attach(opened)
         if opened.resumption is not None:
             self._service.metrics.session_resumed(opened.resumption)
         if opened.resumption == "resumed":
             self._rules.go_on(opened.last_seq, opened.stream_s, time.monotonic())
-        await self._send(self._ready(opened, pipeline))
+        await self._send(self._ready(opened, offer))
 
     def _ensure_session(self) -> OpenSession:
         """The stream's session; a first frame opens one that can't be resumed, because nobody was told its token."""
         if self._opened is None:
-            self._attach(self._service.sessions.open(self._service.loaded.engine, self._caller))
+            self._attach(self._service.sessions.open(self._service.runner, self._caller))
         assert self._opened is not None  # noqa: S101 - attached just now
         return self._opened
 
@@ -177,21 +177,21 @@ class StreamHandler:
         self.wake()
         self._service.metrics.session_opened()
         options = self._rules.options
-        detector = self._service.loaded.engine.pipeline(options.detector).name
+        detector = self._service.runner.offers.chosen(options.detector).detector
         how = "resumed" if opened.resumption == "resumed" else "opened"
         told = (how, self._caller.identity, options.mode, detector)
         _log.info("stream %s by %s, mode %s, detector %s", *told, extra=self._named())
 
-    def _ready(self, opened: OpenSession, pipeline: Pipeline) -> ReadyMessage:
+    def _ready(self, opened: OpenSession, offer: Offer) -> ReadyMessage:
         return ReadyMessage(
             session=opened.id,
             resume_token=opened.token or "",
             resumed=opened.resumption == "resumed",
             last_seq=opened.last_seq,
             mode=self._rules.mode,
-            detector=pipeline.name,
-            model=pipeline.network.name,
-            provider=pipeline.network.provider,
+            detector=offer.detector,
+            model=offer.network.name,
+            provider=offer.network.provider,
             limits=self._service.limits,
         )
 
@@ -217,7 +217,7 @@ class StreamHandler:
     async def _next_answer(self) -> Message:
         """The answer to the next frame. Which one that is shows when its turn has come: until then newer ones count."""
         self._rules.queue(True)
-        async with self._service.loaded.runner.turn(fresh=self._rules.mode == "latest"):
+        async with self._service.runner.turn(fresh=self._rules.mode == "latest"):
             self._rules.queue(False)
             frame = self._rules.take()
             assert frame is not None  # noqa: S101 - of waiting frames one always stays
@@ -252,7 +252,7 @@ class StreamHandler:
         opened.working = True
         try:
             encoded = EncodedFrame(frame.data, frame.timestamp, frame.arrived, frame.deadline)
-            processed = await self._service.loaded.runner.run(opened.session, encoded)
+            processed = await self._service.runner.run(opened.camera, encoded)
             opened.last_seq, opened.stream_s = frame.seq, self._rules.stream_s(time.monotonic())
             return processed
         finally:

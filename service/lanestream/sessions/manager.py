@@ -17,10 +17,9 @@ from lanestream.sessions.record import SessionRecord
 from lanestream.sessions.store import Entry, SessionStore
 
 if TYPE_CHECKING:
-    from lanestream.engine import Engine
     from lanestream.protocol import DetectorName, StartMessage
     from lanestream.sessions.caller import Caller
-    from lanestream.sessions.session import Session
+    from lanestream.sessions.runner import Camera, FrameRunner
 
 _log = logging.getLogger(__name__)
 
@@ -58,7 +57,7 @@ class OpenSession:
     """
 
     id: str
-    session: Session
+    camera: Camera
     caller: Caller
     born: float
     token: str | None = None
@@ -117,7 +116,7 @@ class SessionManager:
 
     def open(
         self,
-        engine: Engine,
+        runner: FrameRunner,
         caller: Caller,
         horizon: float | None = None,
         detector: DetectorName | None = None,
@@ -125,33 +124,33 @@ class SessionManager:
     ) -> OpenSession:
         """A new session without a token; `horizon` as a share of the image height.
 
-        Raises BusyError at a limit, NoDetectorError where `detector` is not loaded.
+        Raises BusyError at a limit, NoDetectorError where `detector` is not offered.
         """
         self.check_limits(caller)
-        session = engine.open_session(horizon, detector)
-        opened = OpenSession(name or secrets.token_hex(8), session, caller, self._wall())
+        camera = runner.open_camera(horizon, detector)
+        opened = OpenSession(name or secrets.token_hex(8), camera, caller, self._wall())
         self._open.add(opened)
         return opened
 
     @contextmanager
     def opened(
-        self, engine: Engine, caller: Caller, horizon: float | None = None, detector: DetectorName | None = None
+        self, runner: FrameRunner, caller: Caller, horizon: float | None = None, detector: DetectorName | None = None
     ) -> Iterator[OpenSession]:
         """A session for the length of a `with` block."""
-        opened = self.open(engine, caller, horizon, detector)
+        opened = self.open(runner, caller, horizon, detector)
         try:
             yield opened
         finally:
             self._open.discard(opened)
 
-    async def start(self, engine: Engine, caller: Caller, message: StartMessage) -> OpenSession:
+    async def start(self, runner: FrameRunner, caller: Caller, message: StartMessage) -> OpenSession:
         """The session that `message` asks for: that of its token, where it lives and is the caller's, else a new one.
 
-        Raises BusyError at a limit, NoDetectorError where its detector is not loaded.
+        Raises BusyError at a limit, NoDetectorError where its detector is not offered.
         """
         owner = secrets.token_hex(8)
         record = None if message.resume_token is None else await self._taken(message.resume_token, caller, owner)
-        opened = self.open(engine, caller, message.horizon, message.detector, message.session)
+        opened = self.open(runner, caller, message.horizon, message.detector, message.session)
         opened.owner = owner
         opened.token = secrets.token_urlsafe(32)
         if message.resume_token is not None:
@@ -215,7 +214,7 @@ class SessionManager:
     def _restored(self, opened: OpenSession, record: SessionRecord) -> bool:
         """Whether `opened` now goes on where `record` ends."""
         try:
-            opened.session.restore(record.state, 0 if record.clean else _IDS_LOST)
+            opened.camera.restore(record.state, 0 if record.clean else _IDS_LOST)
         except ValueError:
             _log.warning("session %s was saved in a way that is not understood; it begins anew", record.session)
             return False
@@ -231,7 +230,7 @@ class SessionManager:
             stream_s=opened.stream_s,
             last_seq=opened.last_seq,
             clean=clean,
-            state=opened.session.state,
+            state=opened.camera.state,
         )
 
     def _note_again(self, opened: OpenSession) -> None:
