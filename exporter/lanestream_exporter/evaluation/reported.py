@@ -16,7 +16,7 @@ OUTERMOST: Final = 2
 
 # How near to the horizon a boundary is reported, as a share of the depth below it: beyond its `top` the curve goes on.
 # Chosen on the training split.
-NEAREST: Final = 0.06
+NEAREST: Final = 0.05
 
 
 def reported_columns(found: Sequence[Found], rows: FloatArray, frame: LabelledFrame) -> list[FloatArray]:
