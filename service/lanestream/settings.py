@@ -105,7 +105,9 @@ class Settings(BaseSettings):
         default=2.0, gt=0.0, description="In mode `latest` a frame that waited so long is dropped."
     )
     handshake_s: float = Field(
-        default=10.0, gt=0.0, description="The first message of a stream comes within this time."
+        default=10.0,
+        gt=0.0,
+        description="The head of a request, and the first message of a stream, come within this time.",
     )
     body_s: float = Field(default=30.0, gt=0.0, description="A single image has to come within this time.")
     idle_s: float = Field(default=60.0, gt=0.0, description="A stream from which nothing comes for so long is closed.")

@@ -67,6 +67,31 @@ def test_a_body_that_stops_is_waited_for_and_then_refused(serve: Serve, headers:
     lives(place)
 
 
+@pytest.mark.parametrize("said", [b"", b"G", b"GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: "])
+def test_a_head_that_stops_is_waited_for_and_then_refused(serve: Serve, said: bytes) -> None:
+    place = urlsplit(serve(fakes.engine(), handshake_s=0.2))
+    address = (place.hostname, place.port)
+    with socket.create_connection(address, timeout=fakes.WAIT_S) as silent:
+        silent.sendall(said)
+        assert answer(silent)[:2] == (408, b"http/1.1 408 request timeout\r\nconnection: close\r\ncontent-length: 0")
+    with socket.create_connection(address, timeout=fakes.WAIT_S) as second:
+        second.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+        assert second.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
+        second.sendall(said)
+        assert b"200 OK" not in b"".join(iter(lambda: second.recv(1 << 16), b""))
+    lives(place.geturl())
+
+
+def test_a_head_that_came_in_time_has_all_the_time_it_needs(serve: Serve) -> None:
+    place = serve(fakes.engine(), handshake_s=0.2)
+    with begun(place, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]) as slow, stream(place, mode="all") as camera:
+        fakes.pause(0.5)
+        slow.sendall(IMAGE[500:])
+        assert slow.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
+        camera.send(IMAGE)
+        assert heard(camera)["type"] == "lanes"
+
+
 def test_a_slow_body_holds_no_session(serve: Serve) -> None:
     place = serve(fakes.engine(), max_sessions=1)
     with begun(place, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]) as slow:

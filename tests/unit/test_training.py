@@ -12,19 +12,21 @@ from torch.nn import functional
 
 from lanestream.errors import CheckpointError, SettingsError
 from lanestream_exporter.training.average import WeightAverage
-from lanestream_exporter.training.checkpoints import read_checkpoint
+from lanestream_exporter.training.checkpoints import read_checkpoint, write_checkpoint
+from lanestream_exporter.training.classifier import starting_network
 from lanestream_exporter.training.config import (
     SHIPPED,
     AdamW,
     ClassifierConfig,
     Cosine,
+    NetworkSize,
     Sgd,
     Staircase,
     TrainConfig,
     read_config,
 )
 from lanestream_exporter.training.loop import Batch, Progress, Run, rate_at
-from lanestream_exporter.training.regressor import RegressorConfig
+from lanestream_exporter.training.regressor import RegressorConfig, starting_regressor
 
 
 class Parity:
@@ -175,3 +177,22 @@ def test_a_bad_configuration_costs_one_line(tmp_path: Path, text: str, words: st
     assert message.startswith(str(path))
     assert words in message
     assert "\n" not in message
+
+
+def test_a_regressor_starts_from_the_convolutions_of_its_own_width_alone(tmp_path: Path) -> None:
+    def saved(width: float) -> str:
+        size = NetworkSize(size=63, width=width, hidden=8)
+        path = tmp_path / f"{width}.pt"
+        write_checkpoint(path, {"network": starting_network(ClassifierConfig(network=size)).state_dict()})
+        return str(path)
+
+    size = NetworkSize(size=63, width=0.1, hidden=8)
+    same = saved(0.1)
+    network = starting_regressor(RegressorConfig(network=size, initial=same))
+    for key, value in read_checkpoint(Path(same))["network"].items():
+        if key.startswith("features"):
+            assert torch.equal(network.state_dict()[key], value)
+    write_checkpoint(tmp_path / "none.pt", {"network": 3})
+    for other in (saved(0.2), str(tmp_path / "none.pt")):
+        with pytest.raises(CheckpointError, match=r"holds no convolutions of this network .*same \[network\] width"):
+            starting_regressor(RegressorConfig(network=size, initial=other))

@@ -15,7 +15,6 @@ from lanestream.detection import LaneDetector
 from lanestream.inference import OnnxModel, load_network
 from lanestream.inference.providers import offered, without_gpus
 from lanestream.lanes import Detection
-from lanestream.processors import network_threads
 from lanestream.runtime import RuntimeOptions
 from lanestream_exporter.exporting.subject import Check, Figures
 
@@ -119,7 +118,7 @@ def timed(paths: Mapping[str, Path], inputs: NDArray[np.uint8]) -> Times:
     Whatever else the machine does slows all of them alike, so that their ratio holds where the numbers don't.
     """
     batch = np.resize(inputs[: BATCHES[-1]], (BATCHES[-1], *inputs.shape[1:]))
-    options, offer = RuntimeOptions(network_threads()), without_gpus(offered())
+    options, offer = RuntimeOptions(threads=1), without_gpus(offered())
     models = {name: load_network(path, "auto", options, offer) for name, path in paths.items()}
     taken: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(_ROUNDS + 2):

@@ -16,6 +16,7 @@ import uvicorn
 
 from lanestream.api.access import warn_if_open
 from lanestream.api.app import create_app
+from lanestream.api.heads import punctual
 from lanestream.errors import SettingsError
 from lanestream.logs import log_config
 from lanestream.sessions.parcels import Setup
@@ -65,6 +66,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     """How uvicorn serves `app`: frames are JPEGs, so deflate would cost 20 times the work and save nothing."""
     return uvicorn.Config(
         app,
+        http=punctual(settings.handshake_s),
         ws="websockets-sansio",
         # What is somewhat too large gets an error of its own; what is far too large costs the socket, not the session.
         ws_max_size=2 * settings.max_bytes,
