@@ -22,7 +22,8 @@ def main(path: Path) -> None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise click.ClickException(f"{path} is not what `lanestream evaluate --json` writes: {error}") from error
     for title, head, rows in (
-        ("A. Candidates", _CANDIDATES, _rows(images, _candidates)),
+        ("A. Candidates by the classifier", _CANDIDATES, _rows(images, _candidates)),
+        ("A. Candidates by the detector", _CANDIDATES, _rows(images, _decided)),
         ("Proposal recall", _PROPOSED, _rows(images, _proposed)),
         ("B. Single images", _BOUNDARIES, _rows(images, lambda groups: _boundaries(groups["boundaries"]))),
         ("B. With the tracker", _BOUNDARIES, _rows(clips, lambda groups: _boundaries(groups["tracked"]))),
@@ -56,7 +57,14 @@ def _rows(methods: Mapping[str, Any], cells: Any) -> Iterable[list[str]]:
 def _candidates(groups: Groups) -> list[str]:
     if "candidates" not in groups:
         return []
-    part = groups["candidates"]["far_40"]
+    return _judged(groups["candidates"]["far_40"])
+
+
+def _decided(groups: Groups) -> list[str]:
+    return _judged(groups["candidates"]["decided"]["far_40"]) if "candidates" in groups else []
+
+
+def _judged(part: Groups) -> list[str]:
     tp, fp, fn, tn = (part["confusion"][key] for key in ("tp", "fp", "fn", "tn"))
     return [
         _counted(part, "precision", tp, tp + fp),

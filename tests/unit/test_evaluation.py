@@ -17,7 +17,7 @@ from lanestream_exporter.evaluation.bootstrap import blocks, intervals, measured
 from lanestream_exporter.evaluation.boundaries import Found, match, match_ego
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
-from lanestream_exporter.evaluation.outcomes import Outcome, judge
+from lanestream_exporter.evaluation.outcomes import RULES, Outcome, judge
 from lanestream_exporter.evaluation.steadiness import steadiness
 
 Array = NDArray[np.float64]
@@ -250,6 +250,11 @@ def test_candidates_under_both_rules() -> None:
     bins = figures["far_40"]["calibration"]["bins"]
     assert [b["count"] for b in bins] == [0, 1, 1, 0, 0, 0, 0, 0, 0, 1]
     assert figures["far_40"]["calibration"]["expected_error"] == pytest.approx((0.05 + 0.75 + 0.15) / 3, abs=1e-3)
+    assert figures["decided"] == {rule: figures[rule] for rule in RULES}, "without a glance the classifier decides"
+    word = replace(judged, decided=np.array([0.95, 0.75, 0.95, 0.15]))
+    decided = candidate_figures([Outcome(labels, (), word)], 0.5)
+    assert decided["decided"]["far_40"]["confusion"] == {"tp": 2, "fp": 0, "fn": 0, "tn": 1}
+    assert decided["far_40"] == figures["far_40"]
     recall = figures["proposal_recall"]["ego"]
     assert recall["labels"] == 2
     assert recall["found"][:4] == [0, 0, 1, 1]  # the last but one of the reversed list is the first true one

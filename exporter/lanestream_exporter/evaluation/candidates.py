@@ -15,6 +15,8 @@ from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, RULES, Judg
 from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, UNSURE
 
 _BINS = 10
+# Whose word is measured: the classifier's own, or what the detector decides by.
+_OWN, _DECIDED = "probabilities", "decided"
 
 
 def candidate_figures(outcomes: Sequence[Outcome], threshold: float) -> dict[str, Any]:
@@ -22,20 +24,21 @@ def candidate_figures(outcomes: Sequence[Outcome], threshold: float) -> dict[str
     return {
         "threshold": threshold,
         **{rule: _judged(outcomes, rule, threshold) for rule in RULES},
+        "decided": {rule: _judged(outcomes, rule, threshold, _DECIDED) for rule in RULES},
         "proposal_recall": {"ego": _proposed(outcomes, True), "all": _proposed(outcomes, False)},
     }
 
 
-def clear_candidates(outcomes: Sequence[Outcome], rule: str) -> tuple[NDArray[np.bool_], FloatArray]:
+def clear_candidates(outcomes: Sequence[Outcome], rule: str, word: str = _OWN) -> tuple[NDArray[np.bool_], FloatArray]:
     """(truth, probability), each (N,), of the candidates that are clearly true or false."""
-    pairs = [_clear(judged, rule) for judged in _all(outcomes)]
+    pairs = [_clear(judged, rule, word) for judged in _all(outcomes)]
     truth = np.concatenate([t for t, _ in pairs]) if pairs else np.zeros(0, bool)
     return truth, np.concatenate([p for _, p in pairs]) if pairs else np.zeros(0)
 
 
-def _judged(outcomes: Sequence[Outcome], rule: str, threshold: float) -> dict[str, Any]:
-    truth, probability = clear_candidates(outcomes, rule)
-    counts = np.array([_confusion(*_clear(judged, rule), threshold) for judged in _all(outcomes)]).reshape(-1, 4)
+def _judged(outcomes: Sequence[Outcome], rule: str, threshold: float, word: str = _OWN) -> dict[str, Any]:
+    truth, probability = clear_candidates(outcomes, rule, word)
+    counts = np.array([_confusion(*_clear(judged, rule, word), threshold) for judged in _all(outcomes)]).reshape(-1, 4)
     frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
     verdicts = np.concatenate([judged.verdicts[rule] for judged in _all(outcomes)] or [np.zeros(0, np.int64)])
     names = {"true": TRUE, "false": FALSE, "unsure": UNSURE, "unknown": UNKNOWN}
@@ -110,10 +113,11 @@ def _all(outcomes: Sequence[Outcome]) -> list[JudgedCandidates]:
     return [outcome.candidates for outcome in outcomes if outcome.candidates is not None]
 
 
-def _clear(judged: JudgedCandidates, rule: str) -> tuple[NDArray[np.bool_], FloatArray]:
+def _clear(judged: JudgedCandidates, rule: str, word: str) -> tuple[NDArray[np.bool_], FloatArray]:
     verdicts = judged.verdicts[rule]
     clear = (verdicts == TRUE) | (verdicts == FALSE)
-    return verdicts[clear] == TRUE, judged.probabilities[clear]
+    probabilities: FloatArray = getattr(judged, word)
+    return verdicts[clear] == TRUE, probabilities[clear]
 
 
 def _confusion(truth: NDArray[np.bool_], probability: FloatArray, threshold: float) -> tuple[int, int, int, int]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import Prepared
+from lanestream.detection.detector import TRUE_LANE, CandidateDetector
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import Found, ego_sides
 from lanestream_exporter.patches import TruthRule, distance_along
@@ -27,9 +28,13 @@ class Proposed:
 
 @dataclass(frozen=True)
 class JudgedCandidates:
-    """Level A of one frame: probabilities (N,), verdicts (N,) under each of `RULES`, and what was proposed at all."""
+    """Level A of one frame: probabilities (N,), verdicts (N,) under each of `RULES`, and what was proposed at all.
+
+    `probabilities` are the classifier's own, `decided` (N,) those by which the detector accepts.
+    """
 
     probabilities: NDArray[np.float64]
+    decided: NDArray[np.float64]
     verdicts: dict[str, NDArray[np.int64]]
     proposed: tuple[Proposed, ...]
 
@@ -53,4 +58,5 @@ def judge(prepared: Prepared, outputs: NDArray[np.float32], wide: Prepared, fram
         true = [d * 1280.0 / frame.width <= near.near and overlap >= near.overlap for d, overlap in measured]
         place = true.index(True) if any(true) else None
         proposed.append(Proposed(any(lane is mine for mine in ego), place))
-    return JudgedCandidates(np.asarray(outputs[:, 1], dtype=np.float64), verdicts, tuple(proposed))
+    own, decided = outputs[:, TRUE_LANE].astype(np.float64), CandidateDetector.judged(prepared, outputs)
+    return JudgedCandidates(own, decided, verdicts, tuple(proposed))

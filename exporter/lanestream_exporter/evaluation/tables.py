@@ -13,14 +13,16 @@ from rich.text import Text
 Values = Callable[[Mapping[str, Any]], list[float | None]]
 
 _LATERAL = ("10 m", "ratio", "30 m", "ratio")
+_JUDGED = ("base rate", "P", "R", "Acc", "AP")
+_DECIDED = (*_JUDGED, "ego prop.", "all prop.")
 _BOUNDARIES = ("ego P", "ego R", "ego F1", "px", "all P", "all R", "all F1")
 
 
 def tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     """A table for each level: a part for each drive, a row for each method."""
     images, clips = figures["images"], figures["clips"]
-    names = ("base rate", "P", "R", "Acc", "AP", "ego prop.", "all prop.")
-    yield _table("A. Candidates: false beyond 40 px; proposed among the first 16", names, images, _candidates)
+    yield _table("A. Candidates by the classifier: false beyond 40 px", _JUDGED, images, _candidates)
+    yield _table("A. Candidates by the detector, and proposed among the first 16", _DECIDED, images, _decided)
     yield _table("B. Single images: boundaries, error in px at 640 wide", _BOUNDARIES, images, _on_images)
     if any(clips.values()):
         yield _table("B. Clips with the tracker", _BOUNDARIES, clips, lambda groups: _boundaries(groups["tracked"]))
@@ -34,9 +36,18 @@ def tables(figures: Mapping[str, Any]) -> Iterator[Table]:
 def _candidates(groups: Mapping[str, Any]) -> list[float | None]:
     if "candidates" not in groups:
         return []
-    part, proposed = groups["candidates"]["far_40"], groups["candidates"]["proposal_recall"]
-    shares = [part[key] for key in ("base_rate", "precision", "recall", "accuracy", "average_precision")]
-    return [*shares, *(proposed[which]["recall_16"] for which in ("ego", "all"))]
+    return _shares(groups["candidates"]["far_40"])
+
+
+def _decided(groups: Mapping[str, Any]) -> list[float | None]:
+    if "candidates" not in groups:
+        return []
+    part, proposed = groups["candidates"]["decided"]["far_40"], groups["candidates"]["proposal_recall"]
+    return [*_shares(part), *(proposed[which]["recall_16"] for which in ("ego", "all"))]
+
+
+def _shares(part: Mapping[str, Any]) -> list[float | None]:
+    return [part[key] for key in ("base_rate", "precision", "recall", "accuracy", "average_precision")]
 
 
 def _on_images(groups: Mapping[str, Any]) -> list[float | None]:

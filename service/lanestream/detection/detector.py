@@ -68,7 +68,7 @@ class CandidateDetector:
         line runs the patches tell better.
         """
         told = outputs[:, TRUE_LANE].astype(np.float64)
-        probability = _judged(told, prepared)
+        probability = self.judged(prepared, outputs)
         order = np.argsort(-told, kind="stable")
         accepted = order[probability[order] >= self.threshold]
         candidates = [prepared.candidates[i] for i in accepted]
@@ -86,6 +86,15 @@ class CandidateDetector:
         ]
         detections.sort(key=lambda detection: -detection.probability)
         return Findings(tuple(self._apart(detections, prepared.view)), prepared.view, prepared.horizon_weight)
+
+    @staticmethod
+    def judged(prepared: Prepared, outputs: NDArray[np.float32]) -> FloatArray:
+        """How likely each candidate (N,) is a boundary: the classifier's word, and a glance's on where it runs."""
+        told = outputs[:, TRUE_LANE].astype(np.float64)
+        if prepared.prior is None:
+            return told
+        odds = prepared.prior.odds([candidate.curve for candidate in prepared.candidates])
+        return np.asarray(told * odds / (1.0 - told + told * odds))
 
     def _together(
         self,
@@ -115,14 +124,6 @@ class CandidateDetector:
         on_one_side = (gaps > 0.0).all(axis=2) | (gaps < 0.0).all(axis=2)
         kept = _kept(on_one_side & (np.abs(gaps).min(axis=2) > self.separation))
         return sorted((detections[i] for i in kept), key=lambda d: float(d.curve.x(view.bottom)))
-
-
-def _judged(told: FloatArray, prepared: Prepared) -> FloatArray:
-    """The classifier's probabilities (N,) with what a glance at the frame says of the candidates' places."""
-    if prepared.prior is None:
-        return told
-    odds = prepared.prior.odds([candidate.curve for candidate in prepared.candidates])
-    return told * odds / (1.0 - told + told * odds)
 
 
 def _kept(apart: NDArray[np.bool_]) -> list[int]:
