@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Final
 
-_ROOT: Final = Path("/")
-# Where the controller of processors is mounted: version 2 alone, beside version 1, and version 1 by its usual names.
-_VERSION_2: Final = ("sys/fs/cgroup", "sys/fs/cgroup/unified")
-_VERSION_1: Final = ("sys/fs/cgroup/cpu", "sys/fs/cgroup/cpu,cpuacct", "sys/fs/cgroup/cpuacct,cpu")
+from lanestream.cgroups import ROOT, VERSION_2, limits
 
-_Read = Callable[[Path], float | None]
+# Where version 1 has the controller of processors, by its usual names.
+_VERSION_1: Final = ("sys/fs/cgroup/cpu", "sys/fs/cgroup/cpu,cpuacct", "sys/fs/cgroup/cpuacct,cpu")
 
 
 def processors() -> int:
@@ -27,42 +24,14 @@ def affinity() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def quota(root: Path = _ROOT) -> float | None:
+def quota(root: Path = ROOT) -> float | None:
     """Processors that a container's limit is worth, such as 1.5; None where there is none.
 
     The limit of an outer control group holds for those in it, hence the least counts. Both versions of control groups
     are read below `root`; files that are missing or not understood are no limit.
     """
-    limits = [*_limits(root, "", _VERSION_2, _limit_2), *_limits(root, "cpu", _VERSION_1, _limit_1)]
-    return min(limits, default=None)
-
-
-def _limits(root: Path, controller: str, mounts: tuple[str, ...], read: _Read) -> Iterator[float]:
-    group = _group(root, controller)
-    # In a container the names may be the host's while its own group is mounted at the top: the top is always read.
-    inner = [group, *group.parents] if group.is_absolute() else [PurePosixPath("/")]
-    for mount in mounts:
-        for each in inner:
-            try:
-                limit = read(root / mount / each.relative_to("/"))
-            except (OSError, ValueError):
-                continue
-            if limit is not None:
-                yield limit
-
-
-def _group(root: Path, controller: str) -> PurePosixPath:
-    """This process's group under `controller`, the one of version 2 where that is empty."""
-    try:
-        lines = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        lines = []
-    for line in lines:
-        _, _, rest = line.partition(":")
-        names, _, group = rest.partition(":")
-        if group and controller in names.split(","):
-            return PurePosixPath(group)
-    return PurePosixPath("/")
+    found = [*limits(root, "", VERSION_2, _limit_2), *limits(root, "cpu", _VERSION_1, _limit_1)]
+    return min(found, default=None)
 
 
 def _limit_2(group: Path) -> float | None:

@@ -123,7 +123,7 @@ class Settings(BaseSettings):
         ge=0,
         le=64,
         description="Processes that work on frames, 0 for the service's own alone; if absent one for each processor, "
-        "8 at most, and one where a GPU runs the networks.",
+        "8 at most and no more than there is memory for, and one where a GPU runs the networks.",
     )
     threads: int | None = Field(
         default=None,

@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,9 @@ from lanestream.errors import (
     told_errors,
 )
 from lanestream.imaging import ImageLimits
+from lanestream.sessions.offers import Offers
 from lanestream.sessions.parcels import Setup, packed, receive
-from lanestream.sessions.process_runner import ProcessRunner
+from lanestream.sessions.process_runner import ProcessRunner, usual_processes
 from lanestream.sessions.runner import FrameRunner, Places
 from lanestream.sessions.thread_runner import ThreadRunner
 from lanestream.sessions.worker import EncodedFrame
@@ -147,10 +149,32 @@ async def test_what_can_not_be_loaded_is_told_and_no_process_stays(
     assert not [child for child in psutil.Process().children() if "worker_process" in " ".join(child.cmdline())]
 
 
-async def test_one_process_for_each_processor_and_one_thread_in_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lanestream.sessions.process_runner.processors", lambda: 3)
-    async with started(fakes.engine, None) as runner:
-        assert len(runner.pids) == 3
+@pytest.mark.parametrize(
+    ("there", "memory", "provider", "expected"),
+    [
+        (3, None, "cpu", 3),
+        (64, None, "openvino", 8),
+        (4, 4e9, "cpu", 4),
+        (4, 1.2e9, "cpu", 2),
+        (4, 2e8, "cpu", 1),
+        (4, None, "cuda", 1),
+    ],
+)
+def test_a_process_for_each_processor_where_there_is_memory(
+    monkeypatch: pytest.MonkeyPatch, there: int, memory: float | None, provider: str, expected: int
+) -> None:
+    monkeypatch.setattr("lanestream.sessions.process_runner.processors", lambda: there)
+    monkeypatch.setattr("lanestream.sessions.process_runner.memory_limit", lambda: memory)
+    offer = Offers.of(fakes.engine().pipelines).chosen()
+    assert usual_processes(Offers([replace(offer, network=replace(offer.network, provider=provider))])) == expected
+
+
+async def test_as_many_processes_as_are_usual(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lanestream.sessions.process_runner.usual_processes", lambda _: 3)
+    asked: list[int] = []
+    runner = await ProcessRunner.started(Setup(fakes.engine, LIMITS, 1, LOG), None, lambda n: asked.append(n) or 2)
+    assert (len(runner.pids), asked) == (3, [3])
+    await runner.close()
 
 
 async def test_workers_end_with_the_service(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import LanestreamError, WorkerLostError
+from lanestream.memory import memory_limit
 from lanestream.processors import processors
 from lanestream.sessions.offers import Offers
 from lanestream.sessions.parcels import Done, Job, Setup, packed, received
@@ -28,8 +29,11 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _PROGRAM: Final = "lanestream.sessions.worker_process"
-# A process holds networks of its own, some 150 MB with all they need: more of them are for those who ask for them.
+# More processes are for those who ask for them: each holds networks of its own.
 _MOST_PROCESSES: Final = 8
+# What a worker and the service itself may come to have with frames of any size that is accepted.
+_WORKER_BYTES: Final = 400e6
+_SERVICE_BYTES: Final = 300e6
 # How long the service waits before it starts another worker for one that ended; twice as long after each failure.
 _RESTART_S: Final = 0.5
 _LONGEST_RESTART_S: Final = 30.0
@@ -190,8 +194,9 @@ class ProcessRunner(FrameRunner):
     ) -> ProcessRunner:
         """A runner with warm workers: `threads_of` tells the threads of each of so many `processes`, 1 without it.
 
-        Where None are named, networks on the CPU get a process for each processor, up to 8; those on a device one for
-        all, in which the questions of all cameras meet. Raises what `setup.load` raises.
+        Where None are named, networks on the CPU get a process for each processor, up to 8 and to what a container's
+        memory has room for; those on a device one for all, in which the questions of all cameras meet. Raises what
+        `setup.load` raises.
         """
         workers = [await Worker.started(setup)]
         try:
@@ -273,8 +278,11 @@ async def _add(workers: list[Worker], setup: Setup) -> None:
 
 def usual_processes(offers: Offers) -> int:
     """How many processes work on frames where nobody says how many."""
-    on_processors = all(offer.network.provider in ("cpu", "openvino") for offer in offers.all)
-    return min(processors(), _MOST_PROCESSES) if on_processors else 1
+    if not all(offer.network.provider in ("cpu", "openvino") for offer in offers.all):
+        return 1
+    memory = memory_limit()
+    room = _MOST_PROCESSES if memory is None else max(1, int((memory - _SERVICE_BYTES) / _WORKER_BYTES))
+    return min(processors(), room, _MOST_PROCESSES)
 
 
 def _lost() -> WorkerLostError:
