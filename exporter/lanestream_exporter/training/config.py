@@ -65,9 +65,9 @@ class TrainConfig(Section):
     """
 
     seed: NonNegativeInt = 1
-    steps: PositiveInt = 4000
+    steps: PositiveInt = 8000
     batch: Annotated[int, Field(ge=2)] = 96
-    check_every: PositiveInt = 400
+    check_every: PositiveInt = 800
     ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.998
     clip: Annotated[float, Field(ge=0.0)] = 5.0
     initial: str | None = None
@@ -107,7 +107,7 @@ class PatchData(Section):
     with about `validation_share` of their drives where there are none.
     """
 
-    rendered_scenes: NonNegativeInt = 3000
+    rendered_scenes: NonNegativeInt = 4000
     validation_scenes: PositiveInt = 50
     real_share: Share = 0.25
     final_real_share: Share = 0.5

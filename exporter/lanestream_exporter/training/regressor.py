@@ -38,8 +38,8 @@ class FrameData(PatchData):
 class RegressorConfig(TrainConfig):
     """The regressor's run."""
 
-    steps: PositiveInt = 2400
-    check_every: PositiveInt = 300
+    steps: PositiveInt = 6000
+    check_every: PositiveInt = 600
     batch: int = Field(default=64, ge=2)
     ema: float = Field(default=0.998, ge=0.0, lt=1.0)
     clip: float = Field(default=5.0, ge=0.0)
