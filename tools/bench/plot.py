@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from bench.plan import LITSERVE, NAIVE, PIPELINE, SERVICE
 
 _LOOKS: Final = {
-    PIPELINE: ("in process, no service", "#8a8f98", "--"),
+    PIPELINE: ("one process, no service", "#8a8f98", "--"),
     SERVICE: ("Lanestream service", "#0b6fb8", "-"),
     LITSERVE: ("LitServe, our detector", "#d98c1f", "-"),
     NAIVE: ("naive service", "#b03a2e", "-"),
@@ -55,7 +55,7 @@ def _rates(axes: Axes, told: Mapping[str, Any]) -> None:
     axes.set_xticks(counts, [str(count) for count in counts])
     axes.set_ylim(bottom=0.0)
     axes.set(title="Throughput: higher is better", xlabel="cameras at a time", ylabel="frames a second, all together")
-    axes.legend(fontsize=8, loc="center right", bbox_to_anchor=(1.0, 0.68))
+    axes.legend(fontsize=8, loc="center right", bbox_to_anchor=(1.0, 0.52))
     axes.grid(alpha=0.3)
 
 
