@@ -151,7 +151,10 @@ def bench(clips: Clips, provider: Provider, folder: Path) -> Iterator[Bench]:
     with ExitStack() as stack:
         pipeline = _helper(stack, run_pipeline, clips, provider)
         hello: Hello = pipeline.hello()
-        Watched(pipeline.pid).suspend()
+        watched = Watched(pipeline.pid)
+        # With its workers, which would wait for ever where they were held still when it ended.
+        stack.callback(watched.end)
+        watched.suspend()
         generators = [_helper(stack, generate, clips) for _ in range(GENERATORS)]
         for generator in generators:
             generator.hello()
