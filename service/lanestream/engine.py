@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from lanestream.detection import LaneDetector, Network, Pipeline, in_one
+from lanestream.detection import LaneDetector, Network, Pipeline, chosen, in_one
 from lanestream.detection.detector import CandidateDetector
 from lanestream.detection.prior import RoadGlance
 from lanestream.detection.regression import RegressionDetector
 from lanestream.detection.strips import StripCutter
-from lanestream.errors import ModelError, NoDetectorError
+from lanestream.errors import ModelError
 from lanestream.geometry import CanvasGeometry, StripGeometry
 from lanestream.inference import ClassifierInfo, LoadedNetwork, RegressorInfo, load_network
 from lanestream.lanes import FrameResult, Image
@@ -45,11 +45,7 @@ class Engine:
 
     def pipeline(self, name: DetectorName | None = None) -> Pipeline:
         """The pipeline of that name, the default one where None. Raises NoDetectorError where it is not loaded."""
-        for pipeline in self.pipelines:
-            if name in (None, pipeline.name):
-                return pipeline
-        names = ", ".join(pipeline.name for pipeline in self.pipelines)
-        raise NoDetectorError(f"there is no detector {name} here", f"ask for {names}")
+        return chosen({pipeline.name: pipeline for pipeline in self.pipelines}, name)
 
     def open_session(self, horizon: float | None = None, detector: DetectorName | None = None) -> Session:
         """A session for one camera; `horizon` is its row as a share of the image height, estimated where None.

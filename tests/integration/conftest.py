@@ -6,7 +6,9 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
+import cv2
 import fakes
+import numpy as np
 import pytest
 
 from lanestream.api import create_app
@@ -14,6 +16,7 @@ from lanestream.api.server import Server, listen
 from lanestream.engine import Engine, load_engine
 from lanestream.settings import Settings
 from lanestream_client.overlays import draw_lanes
+from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
 Serve = Callable[..., str]
 
@@ -67,3 +70,11 @@ def real_url(real_engine: Engine) -> Iterator[str]:
     """A server with the shipped network."""
     with serving(real_engine, Settings()) as place:
         yield place
+
+
+@pytest.fixture(scope="session")
+def road() -> bytes:
+    """A frame of a rendered highway whose boundaries are surely seen, as a JPEG."""
+    clip = sample_clip(np.random.default_rng(24), 640, 360, frames=1, fps=25.0, drive=Drive("highway", fair=True))
+    (frame,) = render_clip(clip)
+    return cv2.imencode(".jpg", frame.image)[1].tobytes()

@@ -10,16 +10,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import fakes
-import numpy as np
 import pytest
 from processes import service
 from redisserver import redis_server
 
 from lanestream.protocol import EgoModel
 from lanestream_client import LaneClient, SourceFrame, StreamResult
-from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
 Serve = Callable[..., str]
 STREAMS = 4
@@ -105,14 +102,6 @@ def test_ids_go_on_over_broken_connections(url: str, mode: str) -> None:
     assert (total.frames, total.dropped) == (60, 60 - len(results))
     assert mode == "latest" or total.dropped == 0
     assert {result.error.code for result in results if result.error} <= {"lost"}
-
-
-@pytest.fixture(scope="module")
-def road() -> bytes:
-    """A rendered highway, which stands still."""
-    clip = sample_clip(np.random.default_rng(24), 640, 360, frames=1, fps=25.0, drive=Drive("highway", fair=True))
-    (frame,) = render_clip(clip)
-    return cv2.imencode(".jpg", frame.image)[1].tobytes()
 
 
 @dataclass

@@ -8,26 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import fakes
 import httpx
-import numpy as np
 import psutil
-import pytest
 from processes import service
 from talking import heard, stream, tell
 
-from lanestream_exporter.scenes import Drive, render_clip, sample_clip
-
 CREDITS = 4
-
-
-@pytest.fixture(scope="module")
-def picture_of_a_road() -> bytes:
-    """A frame whose boundaries are surely seen, as a JPEG."""
-    clip = sample_clip(np.random.default_rng(24), 640, 360, frames=1, fps=25.0, drive=Drive("highway", fair=True))
-    (frame,) = render_clip(clip)
-    return cv2.imencode(".jpg", frame.image)[1].tobytes()
 
 
 @dataclass
@@ -63,9 +50,9 @@ def workers(process: int) -> list[psutil.Process]:
     return sorted(psutil.Process(process).children(), key=lambda child: (child.create_time(), child.pid))
 
 
-def test_a_worker_that_is_killed_loses_the_frames_it_had_and_nothing_else(picture_of_a_road: bytes) -> None:
+def test_a_worker_that_is_killed_loses_the_frames_it_had_and_nothing_else(road: bytes) -> None:
     with service(credits=CREDITS, processes=2) as (process, url):
-        cameras = [Camera(url, picture_of_a_road) for _ in range(3)]
+        cameras = [Camera(url, road) for _ in range(3)]
         threads = [threading.Thread(target=camera.run) for camera in cameras]
         for thread in threads:
             thread.start()

@@ -7,7 +7,7 @@ told by generators, `Steps`: they yield questions and are sent the answers, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.errors import NoDetectorError
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve, Detection, Image
 from lanestream.protocol import DetectorName
@@ -226,3 +227,12 @@ class Pipeline:
         prior, survey = yield from beside(looking, lambda: self.detector.survey(image, horizon))
         prepared = self.detector.prepare(image, horizon, expected, prior, survey)
         return replace(prepared, prior=prior)
+
+
+def chosen(detectors: Mapping[DetectorName, T], name: DetectorName | None) -> T:
+    """What `detectors` has for `name`, its first where None. Raises NoDetectorError where it has nothing."""
+    if name is None:
+        return next(iter(detectors.values()))
+    if name not in detectors:
+        raise NoDetectorError(f"there is no detector {name} here", f"ask for {', '.join(detectors)}")
+    return detectors[name]

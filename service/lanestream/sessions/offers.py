@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lanestream.errors import NoDetectorError
+from lanestream.detection import chosen
 
 if TYPE_CHECKING:
     from lanestream.detection import Network, Pipeline
@@ -52,8 +52,4 @@ class Offers:
 
     def chosen(self, name: DetectorName | None = None) -> Offer:
         """The offer of that name, the default one where None. Raises NoDetectorError where there is none."""
-        for offer in self.all:
-            if name in (None, offer.detector):
-                return offer
-        names = ", ".join(offer.detector for offer in self.all)
-        raise NoDetectorError(f"there is no detector {name} here", f"ask for {names}")
+        return chosen({offer.detector: offer for offer in self.all}, name)
