@@ -36,10 +36,10 @@ _BACKLOG: Final = 2048
 
 
 def serve(settings: Settings, load: Callable[[], Engine], draw: Draw | None = None) -> None:
-    """Serves until a signal ends it; `load` returns a warm engine; it is called while the service lives, in
-    a thread or in worker processes, which have to be able to import it.
+    """Serves until a signal ends it.
 
-    Raises SettingsError where it can't listen, and what `load` raises.
+    `load` returns a warm engine. It is called while the service lives, in a thread or in worker processes, which have
+    to be able to import it. Raises SettingsError where it can't listen, and what `load` raises.
     """
     # The pool of frame threads is the parallelism; OpenCV's own on top of it would have them fight for processors.
     cv2.setNumThreads(settings.opencv_threads)

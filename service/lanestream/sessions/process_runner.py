@@ -1,4 +1,4 @@
-"""Frames in worker processes: Python runs one thread of a process at a time, and finding lanes is half Python."""
+"""Frames in worker processes: Python runs one thread of a process at a time, and much of finding lanes is Python."""
 
 from __future__ import annotations
 
