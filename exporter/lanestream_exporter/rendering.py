@@ -15,7 +15,6 @@ from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, StripGeometry
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.splits import Split, real_frames
 from lanestream_exporter.patches import PatchMaker
 from lanestream_exporter.patchstore import write_store
 from lanestream_exporter.scenefiles import scene_files
@@ -44,10 +43,6 @@ class PatchStores:
         """
         write = partial(_render_file, self.size)
         return scene_files(self.folder, f"rendered-{self.size}", scenes, write, workers, done)
-
-    def real(self, root: Path, split: Split) -> Path:
-        """One file of patches from the labelled real frames of `split`."""
-        return self.labelled(f"real-{split}", lambda: real_frames(root, split), to_train=split == "train")
 
     def labelled(self, name: str, frames: Callable[[], Frames], to_train: bool) -> Path:
         """One file of patches, told by its `name`, from labelled frames and their BGR pictures.

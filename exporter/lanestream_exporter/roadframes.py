@@ -15,8 +15,8 @@ from lanestream.detection.regression import RegressionDetector
 from lanestream.errors import LabelError
 from lanestream.geometry import Scaling
 from lanestream.lanes import FloatArray, Image
+from lanestream_exporter.datasets.horizons import shared_horizon
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
-from lanestream_exporter.datasets.splits import Split, real_frames
 from lanestream_exporter.scenefiles import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
 
@@ -64,49 +64,12 @@ class RoadFrame:
         return cls(jpeg, width, height, lanes, horizon, frame.exhaustive, frame.group)
 
 
-def shared_horizon(lanes: Sequence[FloatArray], height: int, expected: float | None) -> float | None:
-    """The row under which all boundaries keep to one vanishing point and one bend; None where that can't be told.
-
-    `lanes` are polylines (N, 2). The model is x = v + b (y - h) + k / (y - h) with v, h and k shared; `expected` is
-    about h, where it is known, and draws the answer to it by half where only one boundary is labelled.
-    """
-    lowest = min((float(lane[:, 1].min()) for lane in lanes), default=0.0)
-    rows = np.arange(0.15 * height, min(lowest, 0.8 * height) - 1.0, 0.5)
-    if expected is not None:
-        rows = rows[np.abs(rows - expected) <= 0.08 * height]
-    if not lanes or (len(lanes) < 2 and expected is None) or not len(rows):
-        return expected
-    spread = 0.03 * height
-    costs = [_misfit(lanes, h) + (0.0 if expected is None else ((h - expected) / spread) ** 2) for h in rows]
-    return float(rows[int(np.argmin(costs))])
-
-
-def _misfit(lanes: Sequence[FloatArray], horizon: float) -> float:
-    """Squared residuals of all lanes under the shared model, each point to about a pixel."""
-    blocks, targets = [], []
-    for index, lane in enumerate(lanes):
-        u = lane[:, 1] - horizon
-        own = np.zeros((len(u), len(lanes)))
-        own[:, index] = u
-        weight = np.sqrt(20.0 / len(u))
-        blocks.append(weight * np.hstack([np.ones((len(u), 1)), 100.0 / u[:, None], own]))
-        targets.append(weight * lane[:, 0])
-    design, target = np.concatenate(blocks), np.concatenate(targets)
-    solution = np.linalg.lstsq(design, target, rcond=None)[0]
-    return float(((design @ solution - target) ** 2).sum())
-
-
 def rendered_frames(folder: Path, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
     """A file of rendered frames for each number of `scenes`, the files seeded by their own number; kept where they are.
 
     `done` is told how many scenes have become ready.
     """
     return scene_files(folder, "frames", scenes, _render_file, workers, done)
-
-
-def real_road_frames(root: Path, split: Split) -> list[RoadFrame]:
-    """The project's labelled real frames of a split, made small."""
-    return road_frames(real_frames(root, split))
 
 
 def road_frames(labelled: Iterable[tuple[LabelledFrame, Image]]) -> list[RoadFrame]:

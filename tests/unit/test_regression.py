@@ -17,9 +17,10 @@ from lanestream.geometry import CanvasGeometry, RoadView
 from lanestream.lanes import Curve, Image
 from lanestream_exporter.alexnet import Shape
 from lanestream_exporter.canvases import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.datasets.horizons import shared_horizon
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss, logs_at_shares
-from lanestream_exporter.roadframes import RoadFrame, read_frames, shared_horizon, write_frames
+from lanestream_exporter.roadframes import RoadFrame, read_frames, write_frames
 
 WIDTH, HEIGHT, HORIZON = 640, 360, 150.0
 VIEW = RoadView(WIDTH, HEIGHT, HORIZON)

@@ -15,6 +15,7 @@ import numpy as np
 
 from lanestream.errors import LabelError
 from lanestream.lanes import Image
+from lanestream_exporter.datasets.between import Between
 from lanestream_exporter.datasets.clips import read_clip, read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.records import records
@@ -50,6 +51,16 @@ def real_frames(root: Path, split: Split) -> Iterator[tuple[LabelledFrame, Image
         clip = highway_clip(root, name)
         yield from read_clip(clip.video, clip.labels)
     yield from _country_frames(root / "udacity_ch2", _COUNTRY_FRAMES[split])
+
+
+def training_frames(root: Path, between: Between | None) -> Iterator[tuple[LabelledFrame, Image]]:
+    """The frames of the training split, and those that `between` labels from them, drive after drive."""
+    yield from real_frames(root, "train")
+    if between is None:
+        return
+    for clip in labelled_clips(root, "train"):
+        labelled = read_clip_labels(clip.labels, clip.exhaustive)
+        yield from between.frames(clip.video, {i: frame for i, frame in labelled.items() if i in clip.frames})
 
 
 @dataclass(frozen=True)

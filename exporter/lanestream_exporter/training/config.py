@@ -12,6 +12,7 @@ from pydantic import model_validator as checked
 
 from lanestream.errors import SettingsError
 from lanestream_exporter.alexnet import Shape
+from lanestream_exporter.datasets.between import Between
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -104,13 +105,15 @@ class PatchData(Section):
     """Where patches come from, and which share of each batch is real: `final_real_share` in the last third.
 
     Real frames are the project's own splits; or those of `train`, which are validated with those of `validation`, or
-    with about `validation_share` of their drives where there are none.
+    with about `validation_share` of their drives where there are none. Of videos every `between`-th frame between two
+    labelled ones is trained on, too, as `datasets.between` labels it; 0: none.
     """
 
     rendered_scenes: NonNegativeInt = 4000
     validation_scenes: PositiveInt = 50
     real_share: Share = 0.25
     final_real_share: Share = 0.5
+    between: NonNegativeInt = 5
     train: tuple[Frames, ...] = ()
     validation: tuple[Frames, ...] = ()
     validation_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.2
@@ -124,6 +127,11 @@ class PatchData(Section):
         if self.validation and not self.train:
             raise ValueError("there are frames for validation and none to train on: add [[data.train]]")
         return self
+
+    @property
+    def labelling(self) -> Between | None:
+        """What labels frames between labelled ones, None where none are wanted."""
+        return Between(self.between) if self.between else None
 
     @property
     def wants_real(self) -> bool:

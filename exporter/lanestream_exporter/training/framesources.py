@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lanestream.processors import processors
-from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.roadframes import read_frames, real_road_frames, rendered_frames, road_frames
+from lanestream_exporter.datasets.splits import data_root, real_frames, training_frames
+from lanestream_exporter.roadframes import read_frames, rendered_frames, road_frames
 from lanestream_exporter.scenefiles import files_of
 from lanestream_exporter.training.ownframes import own_frames
 from lanestream_exporter.training.regressor import FrameData, FrameSource
@@ -27,7 +27,8 @@ def frame_sources(
         sources.append(FrameSource("real", road_frames(to_train), road_frames(to_check)))
     elif data.wants_real:
         place = data_root(root)
-        sources.append(FrameSource("real", real_road_frames(place, "train"), real_road_frames(place, "val")))
+        to_train, to_check = training_frames(place, data.labelling), real_frames(place, "val")
+        sources.append(FrameSource("real", road_frames(to_train), road_frames(to_check)))
     if data.rendered_scenes:
         scenes = [data.validation_scenes, *files_of(data.rendered_scenes)]
         paths = rendered_frames(folder, scenes, processors(), lambda more: done(more, sum(scenes)))

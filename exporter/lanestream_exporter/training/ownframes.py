@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from lanestream.lanes import Image
+from lanestream_exporter.datasets.between import frames_between
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.datasets.splits import refuse_leak, split_by_group
@@ -24,9 +25,9 @@ def own_frames(data: PatchData) -> tuple[FrameStream, FrameStream]:
     groups = [frame.group for frame, _ in _frames(data.train)]
     if not data.validation:
         split = split_by_group(groups, data.validation_share)
-        return _of(data.train, split.train), _of(data.train, split.validation)
+        return _of(_to_train(data), split.train), _of(_frames(data.train), split.validation)
     refuse_leak(groups, [frame.group for frame, _ in _frames(data.validation)])
-    return _frames(data.train), _frames(data.validation)
+    return _to_train(data), _frames(data.validation)
 
 
 def own_stores(data: PatchData, stores: PatchStores) -> tuple[Path, Path]:
@@ -44,13 +45,21 @@ def _frames(sources: Sequence[Frames]) -> FrameStream:
         yield from read_dataset(Path(source.path), source.format)
 
 
-def _of(sources: Sequence[Frames], groups: Collection[str]) -> FrameStream:
-    return ((frame, image) for frame, image in _frames(sources) if frame.group in groups)
+def _to_train(data: PatchData) -> FrameStream:
+    """All frames of the sources to train on, and those between labelled ones of their videos."""
+    yield from _frames(data.train)
+    if data.labelling is not None:
+        for source in data.train:
+            yield from frames_between(Path(source.path), source.format, data.labelling)
+
+
+def _of(frames: FrameStream, groups: Collection[str]) -> FrameStream:
+    return ((frame, image) for frame, image in frames if frame.group in groups)
 
 
 def _fingerprint(data: PatchData) -> str:
     """Changes with the sources, how they are divided, and the files in them."""
-    digest = hashlib.sha256(repr((data.train, data.validation, data.validation_share)).encode())
+    digest = hashlib.sha256(repr((data.train, data.validation, data.validation_share, data.between)).encode())
     for source in (*data.train, *data.validation):
         path = Path(source.path)
         files = sorted(path.rglob("*")) if path.is_dir() else [path]

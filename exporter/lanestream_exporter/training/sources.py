@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lanestream.processors import processors
-from lanestream_exporter.datasets.splits import data_root
+from lanestream_exporter.datasets.splits import data_root, real_frames, training_frames
 from lanestream_exporter.rendering import PatchStores
 from lanestream_exporter.scenefiles import files_of
 from lanestream_exporter.training.config import PatchData
@@ -28,8 +28,10 @@ def patch_files(
         train, check = own_stores(data, stores)
         files.append(PatchFiles("real", (train,), (check,)))
     elif data.wants_real:
-        real = data_root(root)
-        files.append(PatchFiles("real", (stores.real(real, "train"),), (stores.real(real, "val"),)))
+        real, between = data_root(root), data.labelling
+        train = stores.labelled(f"real-train-{data.between}", lambda: training_frames(real, between), to_train=True)
+        check = stores.labelled("real-val", lambda: real_frames(real, "val"), to_train=False)
+        files.append(PatchFiles("real", (train,), (check,)))
     if data.rendered_scenes:
         # The first file validates; scenes of the others are trained on.
         scenes = [data.validation_scenes, *files_of(data.rendered_scenes)]

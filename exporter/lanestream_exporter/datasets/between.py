@@ -1,0 +1,204 @@
+"""Labels for the frames between two labelled ones of a clip: boundaries followed from both, kept where the two agree.
+
+A labeller draws one frame in ten or forty, and the road between looks different enough to learn from. A boundary that
+both labelled frames name is moved onto its paint frame by frame, forwards from the one and backwards from the other. A
+follower that goes astray hardly goes where the other one comes from, so what both say is kept and nothing else. No
+network has a say in it, and what none can see yet is labelled as well as what it can.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from lanestream.detection.refinement import Refinement
+from lanestream.errors import LabelError, SourceError
+from lanestream.geometry import RoadView
+from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis
+from lanestream_exporter.datasets.horizons import drive_horizons
+from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.reading import survey
+
+# Nearer to the horizon than this share of the depth nothing is followed.
+_TOP_SHARE: Final = 0.06
+
+# The shares of the depth at which a curve is told anew under another horizon.
+_ANCHORS: Final = np.array([1.0, 0.45, 0.15])
+
+# A label has this many points, and its followers are compared at as many rows.
+_POINTS: Final = 18
+
+
+@dataclass(frozen=True)
+class Between:
+    """Labels every `stride`-th frame between two labelled ones.
+
+    The followers of a boundary agree where they are `agreement` pixels of a 1280 pixel wide image apart on average,
+    measured across them.
+    """
+
+    stride: int = 5
+    agreement: float = 6.0
+    refinement: Refinement = Refinement()
+
+    def frames(self, video: Path, labelled: Mapping[int, LabelledFrame]) -> Iterator[tuple[LabelledFrame, Image]]:
+        """Labelled frames between those of `labelled`, by index in the video, with their BGR images (H, W, 3).
+
+        Frames without a boundary that can be told are left out. Raises SourceError for a video that can't be read.
+        """
+        indices = sorted(labelled)
+        horizons = drive_horizons([labelled[index] for index in indices])
+        ends = [
+            _End(index, labelled[index], horizon)
+            for index, horizon in zip(indices, horizons, strict=True)
+            if horizon is not None
+        ]
+        for (first, last), images in zip(pairwise(ends), _stretches(video, [end.index for end in ends]), strict=False):
+            for index, frame, image in self._between(first, last, images):
+                yield replace(frame, source=f"{video.name}#{index}"), image
+
+    def _between(self, first: _End, last: _End, images: Sequence[Image]) -> Iterator[tuple[int, LabelledFrame, Image]]:
+        """The labelled frames of a stretch with their indices; `images` are all of it, both ends too."""
+        names = [name for name in first.lines if name in last.lines]
+        if not names:
+            return
+        shares = np.linspace(0.0, 1.0, len(images))
+        road = [_Moment.between(first, last, names, float(share)) for share in shares]
+        there = self._followed([first.lines[name].curve for name in names], road, images)
+        back = self._followed([last.lines[name].curve for name in names], road[::-1], images[::-1])[::-1]
+        whole = first.frame.exhaustive and last.frame.exhaustive and set(first.names) == set(last.names) == set(names)
+        for step in range(self.stride, len(images) - 1, self.stride):
+            nearer = first if shares[step] <= 0.5 else last
+            told = [
+                self._label(nearer.lines[name].lane, pair, span, road[step])
+                for name, *pair, span in zip(names, there[step], back[step], road[step].spans, strict=True)
+            ]
+            lanes = tuple(lane for lane in told if lane is not None)
+            if lanes:
+                exhaustive = whole and len(lanes) == len(names)
+                yield first.index + step, replace(nearer.frame, lanes=lanes, exhaustive=exhaustive), images[step]
+
+    def _followed(
+        self, curves: Sequence[Curve], road: Sequence[_Moment], images: Sequence[Image]
+    ) -> list[Sequence[Curve]]:
+        """The `curves` of the first image in every one."""
+        followed = [curves]
+        for image, moment in zip(images[1:], road[1:], strict=True):
+            candidates = [
+                Candidate(_under(curve, moment.view), max(top, moment.view.row_at(_TOP_SHARE)), bottom, 1.0)
+                for curve, (top, bottom) in zip(followed[-1], moment.spans, strict=True)
+            ]
+            followed.append([fit.curve for fit in self.refinement.refine(image, candidates, moment.view)])
+        return followed
+
+    def _label(
+        self, lane: LabelledLane, pair: Sequence[Curve], span: tuple[float, float], moment: _Moment
+    ) -> LabelledLane | None:
+        """The mean of both followers, named as `lane`; None where they don't agree, or little of it is in view."""
+        rows = np.linspace(*span[::-1], _POINTS)
+        there, back = (curve.x(rows) for curve in pair)
+        apart = np.abs(there - back) / np.hypot(1.0, pair[0].slope(rows))
+        if apart.mean() > self.agreement * moment.view.width / 1280.0:
+            return None
+        points = np.stack([0.5 * (there + back), rows], axis=1)
+        inside = points[(points[:, 0] >= 0.0) & (points[:, 0] <= moment.view.width - 1.0)]
+        return replace(lane, points=inside) if len(inside) >= _POINTS // 3 else None
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A labelled boundary as the best curve under its frame's horizon, between the rows (top, bottom) of its `span`."""
+
+    lane: LabelledLane
+    curve: Curve
+    span: tuple[float, float]
+
+
+class _End:
+    """A labelled frame at one end of a stretch: its boundaries that have a name."""
+
+    def __init__(self, index: int, frame: LabelledFrame, horizon: float) -> None:
+        self.index, self.frame = index, frame
+        self.view = RoadView(frame.width, frame.height, horizon)
+        self.names = [lane.lane_id for lane in frame.lanes]
+        lines = {lane.lane_id: self._line(lane) for lane in frame.lanes if lane.lane_id is not None}
+        self.lines = {name: line for name, line in lines.items() if line is not None}
+
+    def _line(self, lane: LabelledLane) -> _Line | None:
+        points = lane.points[lane.points[:, 1] > self.view.row_at(_TOP_SHARE)]
+        if len(points) < 3:
+            return None
+        x, y = points.T
+        scale = np.array([1.0, self.view.depth, 1.0 / self.view.depth])
+        v, b, k = np.linalg.lstsq(curve_basis(self.view.horizon, y) / scale, x, rcond=None)[0] / scale
+        return _Line(lane, Curve(self.view.horizon, (float(v), float(b), float(k))), (float(y.min()), float(y.max())))
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """A frame between two ends: about where its horizon is, and between which rows its boundaries can be seen."""
+
+    view: RoadView
+    spans: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def between(cls, first: _End, last: _End, names: Sequence[int], share: float) -> _Moment:
+        """The frame at `share` of the way from `first` to `last`."""
+        horizon = _mixed(first.view.horizon, last.view.horizon, share)
+        pairs = [(first.lines[name].span, last.lines[name].span) for name in names]
+        spans = [(_mixed(a[0], b[0], share), _mixed(a[1], b[1], share)) for a, b in pairs]
+        return cls(replace(first.view, horizon=horizon), tuple(spans))
+
+
+def frames_between(path: Path, format: str, between: Between) -> Iterator[tuple[LabelledFrame, Image]]:  # noqa: A002
+    """The frames between labelled ones of all videos of the data set at `path`, as `read_dataset` reads it.
+
+    Raises LabelError and SourceError for what can't be read.
+    """
+    clips: dict[Path, dict[int, LabelledFrame]] = {}
+    for sample in survey(path, format):
+        if isinstance(sample, LabelError):
+            raise sample
+        picture = sample.entry.picture
+        if picture.index is not None:
+            clips.setdefault(picture.path, {})[picture.index] = sample.frame
+    for video, labelled in clips.items():
+        yield from between.frames(video, labelled)
+
+
+def _mixed(first: float, last: float, share: float) -> float:
+    return first + share * (last - first)
+
+
+def _under(curve: Curve, view: RoadView) -> Curve:
+    """The same curve, told under the horizon of `view`."""
+    rows: FloatArray = view.horizon + _ANCHORS * view.depth
+    return Curve.through(view.horizon, rows, curve.x(rows))
+
+
+def _stretches(video: Path, ends: Sequence[int]) -> Iterator[list[Image]]:
+    """The images of a video from each index of `ends` to the next one, both included."""
+    capture = cv2.VideoCapture(str(video))
+    if not capture.isOpened():
+        raise SourceError(f"{video} can't be read as a video", "give the path of a video file")
+    try:
+        index, images = 0, deque[Image]()
+        for first, last in pairwise(ends):
+            while index <= last:
+                read, image = capture.read()
+                if not read:
+                    raise SourceError(f"frame {last} of {video} is labelled, but the video has {index} frames")
+                images.append(np.asarray(image, dtype=np.uint8))
+                index += 1
+            while len(images) > last - first + 1:
+                images.popleft()
+            yield list(images)
+    finally:
+        capture.release()
