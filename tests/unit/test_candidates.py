@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from lanestream.detection.candidates import CandidateSearch
 from lanestream.detection.detector import CandidateDetector
+from lanestream.detection.prior import RoadPrior, SeenBoundary
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve
 from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
-from lanestream_exporter.patches import TRUE, TruthRule
+from lanestream_exporter.patches import TRUE, TruthRule, fitted_candidate
 from lanestream_exporter.scenes import Drive, RenderedFrame, render_still, sample_clip
 
 SIZES = [(320, 180), (640, 360), (640, 480), (480, 640), (1280, 720), (3840, 2160)]
@@ -69,6 +70,27 @@ def test_followed_boundaries_come_first_and_fewer_others_with_them() -> None:
     assert len(found) == 16
     assert len(followed) == 12
     assert followed[0].curve == expected[0]
+
+
+def test_the_line_beside_a_boundary_of_the_prior_is_a_candidate_too_unless_boundaries_are_followed() -> None:
+    still = fair_scene(640, 360)
+    view = RoadView(640, 360, still.horizon)
+    fits = (fitted_candidate(lane, view) for lane in ego_labels(still.labels))
+    left, right = (fit.curve for fit in fits if fit is not None)
+    aside = Curve(left.horizon, (left.coefficients[0], left.coefficients[1] + 0.06, left.coefficients[2]))
+    spread = np.full(2, 0.05)
+    prior = RoadPrior(view, SeenBoundary(aside, spread, 1.0), SeenBoundary(right, spread, 1.0))
+
+    def beside(twin: float, expected: list[Curve]) -> int:
+        search = CandidateSearch(twin=twin)
+        found = search.propose(still.image, still.horizon, expected, prior).candidates
+        assert found[0].curve == (expected or [aside])[0]
+        near = [abs(float(candidate.curve.x(view.bottom) - left.x(view.bottom))) for candidate in found]
+        return sum(off < 0.03 * view.depth for off in near)
+
+    assert beside(0.02, []) == 1  # the paint itself
+    assert beside(0.05, []) == 0  # the prior's boundary alone, as all that is near is a repetition of it
+    assert beside(0.02, [aside]) == 0
 
 
 def test_faint_lines_are_no_candidates() -> None:

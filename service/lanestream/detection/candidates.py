@@ -73,7 +73,9 @@ class CandidateSearch:
     below the horizon (markings of 0.10 to 0.30 m seen from 1.2 to 2.2 m, with room for double lines). Candidates nearer
     than `separation` times the rows below the horizon, at two rows, are the same. Where there is a prior but no known
     horizon, lines found without the prior count `unguided` times their strength. Lines fainter than `faintest`, where
-    the strongest of their kind has 1, are hardly ever boundaries, and are no candidates.
+    the strongest of their kind has 1, are hardly ever boundaries, and are no candidates. Where no boundaries are
+    expected, a line that follows one of the prior's, but not as near as `twin`, is a candidate beside it: either may be
+    the more exact one.
     """
 
     hough: ExtendedHough = ExtendedHough()
@@ -92,6 +94,7 @@ class CandidateSearch:
     separation: float = 0.05
     unguided: float = 0.6
     faintest: float = 0.06
+    twin: float = 0.02
 
     def survey(self, image: Image, horizon: float | None = None) -> Survey:
         """What can be seen of a BGR image (H, W, 3) uint8 before there is a prior; `horizon` as for `propose`."""
@@ -127,16 +130,17 @@ class CandidateSearch:
         else:
             point, seen = self._seen_road(survey, guide)
         view = RoadView(grey.shape[1], grey.shape[0], point.y)
-        first = [Lines.along(expected, scaling, view)]
+        known = Lines.along(expected, scaling, view)
         found = [self._found(seen, view, point)]
+        guides, neighbours = Lines.joined([]), Lines.joined([])
         if guide is not None:
             lattice = _lattice(guide, scaling, view, point)
             found = [found[0].weighed(lattice.trust(_slopes(found[0], view, point)))]
             if horizon is None:
                 found.append(self._unguided(grey, scaling, view))
-            first += [Lines.along(guide.curves, scaling, view), _neighbours(lattice, view, point)]
-        ranked = Lines.joined([*first, Lines.joined(found).strong(self.faintest).ranked])
-        kept = ranked.taken(ranked.apart(self.separation, view))
+            guides, neighbours = Lines.along(guide.curves, scaling, view), _neighbours(lattice, view, point)
+        strong = Lines.joined(found).strong(self.faintest).ranked
+        kept = self._kept(known, guides, Lines.joined([neighbours, strong]), view)
         image_view = RoadView(width, height, scaling.to_image(point.y))
         candidates = _candidates(kept, _curves(kept, scaling, view, point), image_view)
         limit = min(self.limit, self.followed) if expected else self.limit
@@ -188,6 +192,20 @@ class CandidateSearch:
         found = self._found(seen, own, point)
         weights = self.unguided * found.strength
         return Lines.along(_curves(found, scaling, own, point), scaling, view).weighed(weights)
+
+    def _kept(self, known: Lines, guides: Lines, others: Lines, view: RoadView) -> Lines:
+        """All lines that keep their distance from those before them; where none are `known`, twins of the guides too.
+
+        A guide's twin is the first of the `others` that is beside it, as `twin` says.
+        """
+        ranked = Lines.joined([known, guides, others])
+        kept = ranked.taken(ranked.apart(self.separation, view))
+        if len(known.near):
+            return kept
+        beside = guides.follow(others, self.separation, view) & ~guides.follow(others, self.twin, view)
+        twins = others.taken(np.unique(beside.argmax(axis=1)[beside.any(axis=1)])) if len(others.near) else others
+        first = np.arange(len(kept.near)) < len(guides.near)
+        return Lines.joined([kept.taken(np.flatnonzero(first)), twins, kept.taken(np.flatnonzero(~first))])
 
     def _rays(self, ridges: Ridges, view: RoadView, point: Perspective) -> Lines:
         """Lines through the vanishing point along which ridges gather."""

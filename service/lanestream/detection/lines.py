@@ -76,19 +76,24 @@ class Lines:
         """The same, strongest first."""
         return self.taken(np.argsort(-self.strength, kind="stable"))
 
-    def apart(self, separation: float, view: RoadView) -> NDArray[np.intp]:
-        """Places of the lines that keep `separation`, in rows below the horizon, from all that are kept before them.
+    def follow(self, others: Lines, separation: float, view: RoadView) -> NDArray[np.bool_]:
+        """For each line (N, M), which of the `others` are nearer to it than `separation`, in rows below the horizon.
 
-        One that is nearer at both rows follows the same marking. Flat lines lie closer to each other than their columns
-        tell, so the distance is measured across them.
+        Lines that are so near at both rows follow the same marking. Flat lines lie closer to each other than their
+        columns tell, so the distance is measured across the other one.
         """
-        slope = (self.near - self.far) / ((NEAR - FAR) * view.depth)
+        slope = (others.near - others.far) / ((NEAR - FAR) * view.depth)
         least = separation * view.depth * np.hypot(1.0, slope)
+        near = np.abs(self.near[:, None] - others.near) < NEAR * least
+        return np.asarray(near & (np.abs(self.far[:, None] - others.far) < FAR * least))
+
+    def apart(self, separation: float, view: RoadView) -> NDArray[np.intp]:
+        """Places of the lines that keep `separation` from all that are kept before them; see `follow`."""
+        same = self.follow(self, separation, view)
         free = np.ones(len(self.near), bool)
         kept = []
         for i in range(len(free)):
             if free[i]:
                 kept.append(i)
-                near = np.abs(self.near - self.near[i]) < NEAR * least
-                free &= ~(near & (np.abs(self.far - self.far[i]) < FAR * least))
+                free &= ~same[i]
         return np.array(kept, np.intp)
