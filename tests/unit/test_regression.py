@@ -249,3 +249,16 @@ def test_boundaries_are_moved_onto_the_paint_beneath_them() -> None:
         inside = rows[np.abs(curve.x(rows) - MIDDLE) < MIDDLE - 4.0]
         np.testing.assert_allclose(detection.curve.x(inside), curve.x(inside), atol=2.5)
         assert (np.linalg.eigvalsh(detection.covariance) > 0.0).all()
+
+
+def test_what_the_network_is_sure_of_is_moved_by_less() -> None:
+    detector, row = RegressionDetector(), 300.0
+
+    def off(deviation: float) -> float:
+        told = answer()
+        told[:6] += 0.012
+        told[6:12] = deviation
+        found = detector.finish(detector.prepare(road(), HORIZON), both(told[None]))
+        return max(abs(float(d.curve.x(row) - c.x(row))) for d, c in zip(found.detections, (LEFT, RIGHT), strict=True))
+
+    assert off(0.02) < 1.5 < off(0.001) < 0.013 * WIDTH

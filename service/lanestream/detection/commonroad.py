@@ -55,8 +55,8 @@ class CommonRoad:
     V, H and K are those of the median boundary give or take `usual`.
     """
 
-    vanishing: float = 0.008
-    bend: float = 0.0015
+    vanishing: float = 0.003
+    bend: float = 0.0006
     outlier: float = 3.0
     usual: tuple[float, float, float] = (0.1, 0.03, 0.03)
 

@@ -61,8 +61,13 @@ class Refinement:
     road: CommonRoad = CommonRoad()
     detail_width: int = 640
 
-    def refine(self, image: Image, candidates: Sequence[Candidate], view: RoadView) -> list[Fit]:
-        """A fit for each candidate of a BGR image (H, W, 3)."""
+    def refine(
+        self, image: Image, candidates: Sequence[Candidate], view: RoadView, doubts: FloatArray | None = None
+    ) -> list[Fit]:
+        """A fit for each candidate of a BGR image (H, W, 3).
+
+        `doubts` (N, 3) are how far off each candidate may be at the `anchors`, in pixels, where that is known.
+        """
         if not candidates:
             return []
         curves = [candidate.curve for candidate in candidates]
@@ -73,7 +78,9 @@ class Refinement:
         along = _Along.of(curves, spans, view, self.rows)
         strips = self._strips(image, along, view)
         bars = [self._bars(strip, leaning) for strip, leaning in zip(strips, along.leaning, strict=True)]
-        return self._fits(along, np.stack(bars), view)
+        if doubts is None:
+            doubts = along.leaning[:, None] * np.asarray(self.doubt) * view.depth
+        return self._fits(along, np.stack(bars), view, doubts)
 
     def _strips(self, image: Image, along: _Along, view: RoadView) -> NDArray[np.float32]:
         """Grey levels (N, rows, cells) of the strip along each curve."""
@@ -114,14 +121,14 @@ class Refinement:
         sides = cv2.copyMakeBorder(mean, 0, 0, width, width, cv2.BORDER_REPLICATE)
         return np.asarray(mean - np.maximum(sides[:, : -2 * width], sides[:, 2 * width :]), dtype=np.float32)
 
-    def _fits(self, along: _Along, bars: NDArray[np.float32], view: RoadView) -> list[Fit]:
+    def _fits(self, along: _Along, bars: NDArray[np.float32], view: RoadView, doubts: FloatArray) -> list[Fit]:
         """Columns at the anchor rows by least squares with the curves so far, and the road they share, as the prior."""
         anchors = view.horizon + np.asarray(self.anchors) * view.depth
         to_curve = np.asarray(np.linalg.inv(curve_basis(view.horizon, anchors)), dtype=float)
         basis = curve_basis(view.horizon, along.y) @ to_curve
         leaning = along.leaning[:, None]
         sigma = self.noise * view.width / 640.0 + self.blur * along.below
-        prior = np.eye(3) / (leaning * np.asarray(self.doubt) * view.depth)[:, None] ** 2
+        prior = np.eye(3) / doubts[:, None] ** 2
         # Sums over a strip's cells, and sums of where they are, in one product.
         across = self._across()
         sums = np.stack([np.ones_like(across), across], axis=1)

@@ -33,6 +33,9 @@ HORIZONS: Final = (0.32, 0.39, 0.46, 0.53, 0.6)
 
 _TOP_SHARE: Final = 0.1
 
+# No boundary is told more exactly than this, in depths.
+_EXACT: Final = 0.003
+
 
 @dataclass(frozen=True)
 class RoadReading:
@@ -87,14 +90,15 @@ class RegressionDetector:
     """Finds the ego lane's boundaries with one look at the whole frame.
 
     A boundary is told from the presence `threshold` on, after `refinement` has moved it onto the paint beneath it.
-    `detail_width` is the width that frames are reduced to before they are warped, so that near rows do not alias. Two
-    boundaries say less of their road than many: far ends are drawn from where the network sees them by less.
+    `detail_width` is the width that frames are reduced to before they are warped, so that near rows do not alias. Paint
+    moves a boundary by as much as the network is unsure of it, `doubt` times the deviations that it tells.
     """
 
     threshold: float = 0.5
     geometry: CanvasGeometry = CanvasGeometry()
     detail_width: int = 448
-    refinement: Refinement = Refinement(reach=0.24, doubt=(0.03, 0.02, 0.015), steps=(0.09, 0.06, 0.04, 0.04))
+    refinement: Refinement = Refinement(reach=0.24, anchors=ANCHORS, steps=(0.09, 0.06, 0.04, 0.04))
+    doubt: float = 1.5
 
     def survey(self, image: Image, horizon: float | None = None) -> None:
         """Nothing: all that this detector does before it asks its network is the picture that it asks about."""
@@ -142,18 +146,19 @@ class RegressionDetector:
         """The boundaries in the network's outputs (2 N, 15), left to right, and the horizon that it saw."""
         reading, view = self.read(prepared, outputs)
         curves = [reading.curve(side, view) for side in (0, 1)]
+        spans = visible_spans(curves, view, _TOP_SHARE)
         seen = [
-            (presence, Candidate(curve, *span, 1.0))
-            for presence, curve, span in zip(
-                reading.presence.tolist(), curves, visible_spans(curves, view, _TOP_SHARE), strict=True
-            )
-            if presence >= self.threshold and span is not None
+            (side, Candidate(curve, *span, 1.0))
+            for side, (curve, span) in enumerate(zip(curves, spans, strict=True))
+            if reading.presence[side] >= self.threshold and span is not None
         ]
-        fits = self.refinement.refine(prepared.image, [candidate for _, candidate in seen], view)
+        sides = [side for side, _ in seen]
+        doubts = np.maximum(self.doubt * view.width * reading.deviations[sides], _EXACT * view.depth)
+        fits = self.refinement.refine(prepared.image, [candidate for _, candidate in seen], view, doubts)
         spans = visible_spans([fit.curve for fit in fits], view, _TOP_SHARE)
         detections = [
-            Detection(fit.curve, fit.covariance, *span, presence)
-            for (presence, _), fit, span in zip(seen, fits, spans, strict=True)
+            Detection(fit.curve, fit.covariance, *span, float(reading.presence[side]))
+            for side, fit, span in zip(sides, fits, spans, strict=True)
             if span is not None
         ]
         return Findings(tuple(detections), view, float(reading.presence.max()))
