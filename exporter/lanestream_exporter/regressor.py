@@ -34,7 +34,7 @@ class LaneRegressor(nn.Module):
     columns are all of one size, which a network learns more easily.
     """
 
-    def __init__(self, size: Shape = FULL, *, normalised: bool = True, dropout: float = 0.3) -> None:
+    def __init__(self, size: Shape = FULL, *, normalised: bool = True, dropout: float = 0.1) -> None:
         super().__init__()
         self.size = size
         trunk = AlexNet(shape=size, normalised=normalised)

@@ -31,15 +31,15 @@ class FrameData(PatchData):
 
     rendered_scenes: NonNegativeInt = 7000
     validation_scenes: PositiveInt = 250
-    real_share: Share = 0.3
-    final_real_share: Share = 0.5
+    real_share: Share = 0.4
+    final_real_share: Share = 0.6
 
 
 class RegressorConfig(TrainConfig):
     """The regressor's run."""
 
-    steps: PositiveInt = 5000
-    check_every: PositiveInt = 500
+    steps: PositiveInt = 6000
+    check_every: PositiveInt = 600
     batch: int = Field(default=64, ge=2)
     ema: float = Field(default=0.998, ge=0.0, lt=1.0)
     clip: float = Field(default=5.0, ge=0.0)
