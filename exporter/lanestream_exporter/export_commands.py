@@ -56,7 +56,7 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
 @click.option(
     "--rank-energy", type=click.FloatRange(0.5, 1.0),
     help="Share of the hidden layers' variance to keep; 1 keeps the layers as they are."
-    "  [default: 0.99 of a classifier's, 0.9999 of a regressor's]",
+    "  [default: 0.998 of a classifier's, 0.9999 of a regressor's]",
 )  # fmt: skip
 @click.option(
     "--tolerance", type=click.FloatRange(0.0, 100.0), default=ExportSettings.tolerance, show_default=True,

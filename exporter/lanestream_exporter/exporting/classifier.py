@@ -60,7 +60,7 @@ class ClassifierSubject:
     input_name = "patches"
     output_name = "probabilities"
     exact = ("network.classifier.6.",)
-    rank_energy = 0.99
+    rank_energy = 0.998
     headline = ("accuracy",)
 
     @property
