@@ -140,7 +140,7 @@ class CandidateSearch:
                 found.append(self._unguided(grey, scaling, view))
             guides, neighbours = Lines.along(guide.curves, scaling, view), _neighbours(lattice, view, point)
         strong = Lines.joined(found).strong(self.faintest).ranked
-        kept = self._kept(known, guides, Lines.joined([neighbours, strong]), view)
+        kept = self._kept(known, [guides, neighbours], strong, view)
         image_view = RoadView(width, height, scaling.to_image(point.y))
         candidates = _candidates(kept, _curves(kept, scaling, view, point), image_view)
         limit = min(self.limit, self.followed) if expected else self.limit
@@ -193,19 +193,21 @@ class CandidateSearch:
         weights = self.unguided * found.strength
         return Lines.along(_curves(found, scaling, own, point), scaling, view).weighed(weights)
 
-    def _kept(self, known: Lines, guides: Lines, others: Lines, view: RoadView) -> Lines:
+    def _kept(self, known: Lines, led: Sequence[Lines], found: Lines, view: RoadView) -> Lines:
         """All lines that keep their distance from those before them; where none are `known`, twins of the guides too.
 
-        A guide's twin is the first of the `others` that is beside it, as `twin` says.
+        Those that a prior `led` to are the guides, its own boundaries, and others. A guide's twin is the first of the
+        `found` lines that is beside it, as `twin` says.
         """
-        ranked = Lines.joined([known, guides, others])
-        kept = ranked.taken(ranked.apart(self.separation, view))
+        ranked = Lines.joined([known, *led, found])
+        places = ranked.apart(self.separation, view)
         if len(known.near):
-            return kept
-        beside = guides.follow(others, self.separation, view) & ~guides.follow(others, self.twin, view)
-        twins = others.taken(np.unique(beside.argmax(axis=1)[beside.any(axis=1)])) if len(others.near) else others
-        first = np.arange(len(kept.near)) < len(guides.near)
-        return Lines.joined([kept.taken(np.flatnonzero(first)), twins, kept.taken(np.flatnonzero(~first))])
+            return ranked.taken(places)
+        guides = led[0]
+        beside = guides.follow(found, self.separation, view) & ~guides.follow(found, self.twin, view)
+        twins = np.unique(beside.argmax(axis=1)[beside.any(axis=1)]) if len(found.near) else np.empty(0, np.intp)
+        first = places < sum(len(lines.near) for lines in led)
+        return Lines.joined([ranked.taken(places[first]), found.taken(twins), ranked.taken(places[~first])])
 
     def _rays(self, ridges: Ridges, view: RoadView, point: Perspective) -> Lines:
         """Lines through the vanishing point along which ridges gather."""
