@@ -78,6 +78,18 @@ def test_a_boundary_that_only_one_side_names_is_unknown_between(clip: Path) -> N
     assert followed(clip, nameless) == []
 
 
+def test_labelled_frames_too_far_apart_tell_nothing_of_those_between(clip: Path) -> None:
+    known, truth = ends(clip)
+    between = Between(stride=2, longest=5)
+    assert list(between.frames(clip / "drive.mp4", known)) == []
+    told = between.frames(clip / "drive.mp4", known | {4: truth[4], 8: truth[8]})
+    assert [frame.source for frame, _ in told] == ["drive.mp4#2", "drive.mp4#6", "drive.mp4#10"]
+    ((frame, image),) = between.frames(clip / "drive.mp4", known | {8: truth[8]})
+    assert frame.source == "drive.mp4#10"
+    whole = dict(enumerate(Between(stride=2).frames(clip / "drive.mp4", known), start=1))
+    np.testing.assert_array_equal(image, whole[5][1])
+
+
 def test_a_label_beyond_the_end_of_the_video_is_told(clip: Path) -> None:
     known, _ = ends(clip)
     known[LAST + 5] = known.pop(LAST)

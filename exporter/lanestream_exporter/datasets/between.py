@@ -38,13 +38,14 @@ _POINTS: Final = 18
 
 @dataclass(frozen=True)
 class Between:
-    """Labels every `stride`-th frame between two labelled ones.
+    """Labels every `stride`-th frame between two labelled ones that are not more than `longest` frames apart.
 
     The followers of a boundary agree where they are `agreement` pixels of a 1280 pixel wide image apart on average,
     measured across them.
     """
 
     stride: int = 5
+    longest: int = 60
     agreement: float = 6.0
     refinement: Refinement = Refinement()
 
@@ -60,7 +61,9 @@ class Between:
             for index, horizon in zip(indices, horizons, strict=True)
             if horizon is not None
         ]
-        for (first, last), images in zip(pairwise(ends), _stretches(video, [end.index for end in ends]), strict=False):
+        pairs = [(first, last) for first, last in pairwise(ends) if last.index - first.index <= self.longest]
+        stretches = _stretches(video, [(first.index, last.index) for first, last in pairs])
+        for (first, last), images in zip(pairs, stretches, strict=True):
             for index, frame, image in self._between(first, last, images):
                 yield replace(frame, source=f"{video.name}#{index}"), image
 
@@ -183,20 +186,20 @@ def _under(curve: Curve, view: RoadView) -> Curve:
     return Curve.through(view.horizon, rows, curve.x(rows))
 
 
-def _stretches(video: Path, ends: Sequence[int]) -> Iterator[list[Image]]:
-    """The images of a video from each index of `ends` to the next one, both included."""
+def _stretches(video: Path, stretches: Sequence[tuple[int, int]]) -> Iterator[list[Image]]:
+    """The images of each of the `stretches` of a video, from its first index to its last, both included."""
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
         raise SourceError(f"{video} can't be read as a video", "give the path of a video file")
     try:
-        index, images = 0, deque[Image]()
-        for first, last in pairwise(ends):
-            while index <= last:
-                read, image = capture.read()
-                if not read:
-                    raise SourceError(f"frame {last} of {video} is labelled, but the video has {index} frames")
-                images.append(np.asarray(image, dtype=np.uint8))
-                index += 1
+        coming, images = 0, deque[Image]()
+        for first, last in stretches:
+            while coming <= last:
+                if not capture.grab():
+                    raise SourceError(f"frame {last} of {video} is labelled, but the video has {coming} frames")
+                if coming >= first:
+                    images.append(np.asarray(capture.retrieve()[1], dtype=np.uint8))
+                coming += 1
             while len(images) > last - first + 1:
                 images.popleft()
             yield list(images)
