@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from lanestream.detection.candidates import CandidateSearch
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_rows
-from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis
+from lanestream.lanes import Candidate, Curve, FloatArray, Image
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.polylines import fitted_curve
 
 FALSE, TRUE, UNSURE, UNKNOWN = 0, 1, 2, 3
 
@@ -82,10 +83,7 @@ def fitted_candidate(lane: LabelledLane, view: RoadView) -> Candidate | None:
     points = lane.points[lane.points[:, 1] > view.row_at(0.08)]
     if len(points) < 3:
         return None
-    basis = curve_basis(view.horizon, points[:, 1])
-    scale = np.array([1.0, view.depth, 1.0 / view.depth])
-    v, b, k = np.linalg.lstsq(basis * scale**-1.0, points[:, 0], rcond=None)[0] / scale
-    curve = Curve(view.horizon, (float(v), float(b), float(k)))
+    curve = fitted_curve(points, view)
     rows = visible_rows(curve, view, 0.1)
     if rows is None or rows[1] - rows[0] < 0.15 * view.depth:
         return None

@@ -217,7 +217,7 @@ def test_a_labelled_frame_beyond_the_videos_end_is_named(tmp_path: Path, clip: P
     write_lines(tmp_path / "drive.jsonl", *records)
     before, beyond = faults(tmp_path)
     assert "drive.jsonl:3: drive.mp4#-1: frame -1 is before the first one" in before
-    assert "drive.jsonl:1: drive.mp4#9: frame 9 is labelled, but drive.mp4 has 3 frames" in beyond
+    assert "drive.jsonl:1: drive.mp4#9: there is no frame 9: drive.mp4 has 3 frames" in beyond
 
 
 def test_bad_tracks_are_named(tmp_path: Path, clip: Path) -> None:

@@ -62,11 +62,13 @@ def test_frames_between_two_labelled_ones_are_labelled_where_the_paint_is(clip: 
 def test_a_boundary_on_which_the_two_sides_differ_is_left_out(clip: Path) -> None:
     known, _ = ends(clip)
     left, right = known[LAST].lanes
-    aside = replace(right, points=right.points - [90.0, 0.0])
+    top = right.points[:, 1].min()
+    # It still meets the others at the horizon.
+    aside = replace(right, points=right.points - np.outer(0.4 * (right.points[:, 1] - top), [1.0, 0.0]))
     known[LAST] = replace(known[LAST], lanes=(left, aside))
-    for frame in followed(clip, known):
-        assert [lane.position for lane in frame.lanes] == [-1]
-        assert not frame.exhaustive  # what lies to the right is not known
+    frames = followed(clip, known)
+    assert [[lane.position for lane in frame.lanes] for frame in frames] == [[-1], [-1]]
+    assert not any(frame.exhaustive for frame in frames)  # what lies to the right is not known
 
 
 def test_a_boundary_that_only_one_side_names_is_unknown_between(clip: Path) -> None:
@@ -78,6 +80,15 @@ def test_a_boundary_that_only_one_side_names_is_unknown_between(clip: Path) -> N
     assert followed(clip, nameless) == []
 
 
+def test_a_name_that_two_boundaries_have_is_no_name(clip: Path) -> None:
+    known, _ = ends(clip)
+    left, right = known[0].lanes
+    known[0] = replace(known[0], lanes=(left, right, replace(left, lane_id=right.lane_id)))
+    frames = followed(clip, known)
+    assert [[lane.position for lane in frame.lanes] for frame in frames] == [[-1], [-1]]
+    assert not any(frame.exhaustive for frame in frames)
+
+
 def test_labelled_frames_too_far_apart_tell_nothing_of_those_between(clip: Path) -> None:
     known, truth = ends(clip)
     between = Between(stride=2, longest=5)
@@ -86,14 +97,15 @@ def test_labelled_frames_too_far_apart_tell_nothing_of_those_between(clip: Path)
     assert [frame.source for frame, _ in told] == ["drive.mp4#2", "drive.mp4#6", "drive.mp4#10"]
     ((frame, image),) = between.frames(clip / "drive.mp4", known | {8: truth[8]})
     assert frame.source == "drive.mp4#10"
-    whole = dict(enumerate(Between(stride=2).frames(clip / "drive.mp4", known), start=1))
-    np.testing.assert_array_equal(image, whole[5][1])
+    *_, (last, same) = Between(stride=2).frames(clip / "drive.mp4", known)
+    assert last.source == frame.source
+    np.testing.assert_array_equal(image, same)
 
 
-def test_a_label_beyond_the_end_of_the_video_is_told(clip: Path) -> None:
+def test_a_video_that_ends_too_early_or_is_none_is_told(clip: Path) -> None:
     known, _ = ends(clip)
     known[LAST + 5] = known.pop(LAST)
-    with pytest.raises(SourceError, match=r"frame 17 of .*drive\.mp4 is labelled, but the video has 13 frames"):
+    with pytest.raises(SourceError, match=r"there is no frame 13: drive\.mp4 has 13 frames"):
         followed(clip, known)
     with pytest.raises(SourceError, match="can't be read as a video"):
         list(Between().frames(clip / "no.mp4", known))

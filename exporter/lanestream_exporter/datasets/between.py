@@ -8,22 +8,23 @@ network has a say in it, and what none can see yet is labelled as well as what i
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 
 from lanestream.detection.refinement import Refinement
-from lanestream.errors import LabelError, SourceError
+from lanestream.errors import LabelError
 from lanestream.geometry import RoadView
-from lanestream.lanes import Candidate, Curve, FloatArray, Image, curve_basis
+from lanestream.lanes import Candidate, Curve, FloatArray, Image
 from lanestream_exporter.datasets.horizons import drive_horizons
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.pictures import Opener, Picture
+from lanestream_exporter.datasets.polylines import fitted_curve
 from lanestream_exporter.datasets.reading import survey
 
 # Nearer to the horizon than this share of the depth nothing is followed.
@@ -76,7 +77,7 @@ class Between:
         road = [_Moment.between(first, last, names, float(share)) for share in shares]
         there = self._followed([first.lines[name].curve for name in names], road, images)
         back = self._followed([last.lines[name].curve for name in names], road[::-1], images[::-1])[::-1]
-        whole = first.frame.exhaustive and last.frame.exhaustive and set(first.names) == set(last.names) == set(names)
+        whole = first.whole and last.whole and len(first.lines) == len(last.lines) == len(names)
         for step in range(self.stride, len(images) - 1, self.stride):
             nearer = first if shares[step] <= 0.5 else last
             told = [
@@ -125,23 +126,26 @@ class _Line:
 
 
 class _End:
-    """A labelled frame at one end of a stretch: its boundaries that have a name."""
+    """A labelled frame at one end of a stretch: its boundaries by their names, those whose name is theirs alone.
+
+    `whole` says that all that can be told of the frame is in them.
+    """
 
     def __init__(self, index: int, frame: LabelledFrame, horizon: float) -> None:
         self.index, self.frame = index, frame
         self.view = RoadView(frame.width, frame.height, horizon)
-        self.names = [lane.lane_id for lane in frame.lanes]
-        lines = {lane.lane_id: self._line(lane) for lane in frame.lanes if lane.lane_id is not None}
+        times = Counter(lane.lane_id for lane in frame.lanes)
+        named = {lane.lane_id: lane for lane in frame.lanes if lane.lane_id is not None and times[lane.lane_id] == 1}
+        lines = {name: self._line(lane) for name, lane in named.items()}
         self.lines = {name: line for name, line in lines.items() if line is not None}
+        self.whole = frame.exhaustive and len(self.lines) == len(frame.lanes)
 
     def _line(self, lane: LabelledLane) -> _Line | None:
         points = lane.points[lane.points[:, 1] > self.view.row_at(_TOP_SHARE)]
         if len(points) < 3:
             return None
-        x, y = points.T
-        scale = np.array([1.0, self.view.depth, 1.0 / self.view.depth])
-        v, b, k = np.linalg.lstsq(curve_basis(self.view.horizon, y) / scale, x, rcond=None)[0] / scale
-        return _Line(lane, Curve(self.view.horizon, (float(v), float(b), float(k))), (float(y.min()), float(y.max())))
+        rows = points[:, 1]
+        return _Line(lane, fitted_curve(points, self.view), (float(rows.min()), float(rows.max())))
 
 
 @dataclass(frozen=True)
@@ -188,20 +192,11 @@ def _under(curve: Curve, view: RoadView) -> Curve:
 
 def _stretches(video: Path, stretches: Sequence[tuple[int, int]]) -> Iterator[list[Image]]:
     """The images of each of the `stretches` of a video, from its first index to its last, both included."""
-    capture = cv2.VideoCapture(str(video))
-    if not capture.isOpened():
-        raise SourceError(f"{video} can't be read as a video", "give the path of a video file")
-    try:
-        coming, images = 0, deque[Image]()
+    images: dict[int, Image] = {}
+    with Opener() as opener:
         for first, last in stretches:
-            while coming <= last:
-                if not capture.grab():
-                    raise SourceError(f"frame {last} of {video} is labelled, but the video has {coming} frames")
-                if coming >= first:
-                    images.append(np.asarray(capture.retrieve()[1], dtype=np.uint8))
-                coming += 1
-            while len(images) > last - first + 1:
-                images.popleft()
-            yield list(images)
-    finally:
-        capture.release()
+            # The end of one stretch is mostly the beginning of the next; a video is decoded forwards.
+            images = {index: image for index, image in images.items() if index >= first}
+            for index in range(first + len(images), last + 1):
+                images[index] = opener.open(Picture(video, index))
+            yield list(images.values())

@@ -57,7 +57,7 @@ class Opener:
                 raise SourceError(f"{video} can't be read as a video")
         while self._read <= index:
             if not self._capture.grab():
-                raise SourceError(f"frame {index} is labelled, but {video.name} has {self._read} frames")
+                raise SourceError(f"there is no frame {index}: {video.name} has {self._read} frames")
             self._read += 1
         decoded, image = self._capture.retrieve()
         if not decoded:

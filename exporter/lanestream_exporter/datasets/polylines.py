@@ -1,4 +1,4 @@
-"""Points of a lane boundary: read from whatever a label file holds, checked, and put from the lowest row upwards."""
+"""Points of a lane boundary: read from whatever a label file holds, checked, put in order from below, and fitted."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.geometry import RoadView
+from lanestream.lanes import Curve, FloatArray, curve_basis
 
 # A hand that places points may slip by this much, in pixels, beyond the picture's edge or back down the boundary.
 SLACK: Final = 1.0
@@ -57,6 +58,14 @@ def sound(points: FloatArray, width: int, height: int) -> FloatArray:
         raise ValueError(f"its points all lie on row {points[0, 1]:g}")
     kept: FloatArray = points[climbs]
     return kept
+
+
+def fitted_curve(points: FloatArray, view: RoadView) -> Curve:
+    """The curve under the view's horizon that is nearest to three or more `points` (N, 2) below it, by columns."""
+    scale = np.array([1.0, view.depth, 1.0 / view.depth])
+    basis = curve_basis(view.horizon, points[:, 1]) / scale
+    v, b, k = (np.linalg.lstsq(basis, points[:, 0], rcond=None)[0] / scale).tolist()
+    return Curve(view.horizon, (v, b, k))
 
 
 def _place(point: FloatArray) -> str:
