@@ -83,7 +83,7 @@ def test_a_boundary_that_only_one_side_names_is_unknown_between(clip: Path) -> N
 def test_a_name_that_two_boundaries_have_is_no_name(clip: Path) -> None:
     known, _ = ends(clip)
     left, right = known[0].lanes
-    known[0] = replace(known[0], lanes=(left, right, replace(left, lane_id=right.lane_id)))
+    known[0] = replace(known[0], lanes=(left, replace(left, lane_id=right.lane_id), right))
     frames = followed(clip, known)
     assert [[lane.position for lane in frame.lanes] for frame in frames] == [[-1], [-1]]
     assert not any(frame.exhaustive for frame in frames)
