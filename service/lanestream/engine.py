@@ -81,7 +81,7 @@ def load_engine(
     """
     network = _warm(model or SHIPPED_MODEL, provider, options)
     if isinstance(network.info, RegressorInfo):
-        return Engine([Pipeline("regression", _regression(network.info), network)])
+        return Engine([_whole_frames(_regression(network.info), network)])
     if regressor is None:
         return Engine([Pipeline("candidates", _candidates(network.info), network)])
     other = _warm(regressor, provider, options)
@@ -92,7 +92,7 @@ def load_engine(
     return Engine(
         [
             Pipeline("candidates", _candidates(network.info), network, glance),
-            Pipeline("regression", regression, other),
+            _whole_frames(regression, other),
         ]
     )
 
@@ -108,6 +108,11 @@ def _warm(path: Path, provider: Provider, options: RuntimeOptions) -> LoadedNetw
     network = load_network(path, provider, options)
     network.warm_up()
     return network
+
+
+def _whole_frames(detector: RegressionDetector, network: Network) -> Pipeline:
+    """The detector that needs one look; a frame whose horizon it does not know it looks at once more, closely."""
+    return Pipeline("regression", detector, network, first_look=RoadGlance(detector, network))
 
 
 def _candidates(info: ClassifierInfo) -> CandidateDetector:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from lanestream.detection.commonroad import Agreement, Boundaries, CommonRoad
-from lanestream.lanes import Curve, FloatArray, curve_basis, curve_columns
+from lanestream.lanes import Curve, FloatArray, curve_columns
 
 HORIZON, DEPTH = 200.0, 400.0
 ROWS = HORIZON + DEPTH * np.array([1.0, 0.45, 0.15])
 VANISHING, BEND = 320.0, 800.0
 
 
-def boundaries(curves: list[Curve]) -> Boundaries:
-    to_curve = np.asarray(np.linalg.inv(curve_basis(HORIZON, ROWS)), dtype=float)
-    return Boundaries(curve_columns(curves, ROWS), to_curve, np.ones(len(curves)), DEPTH)
+def boundaries(curves: list[Curve], horizon: float = HORIZON) -> Boundaries:
+    return Boundaries(curve_columns(curves, ROWS), ROWS, horizon, horizon, np.ones(len(curves)), DEPTH)
 
 
 def on_road(*slopes: float) -> list[Curve]:
@@ -68,3 +68,26 @@ def test_common_horizon_explains_lines_that_meet_below_it() -> None:
     found = agreed(told, np.full((4, 3), 2.0))
     assert np.abs(found.shifts).max() < 1.0
     assert abs(found.road[1] - 8.0) < 2.0
+
+
+def nodded(told: Boundaries, road: CommonRoad) -> Boundaries:
+    """The boundaries below the horizon that they agree on, whose columns are known to half a pixel."""
+    normal = np.broadcast_to(np.eye(3) / 0.25, (len(told.columns), 3, 3))
+    found = road.begun(told)
+    for _ in range(6):
+        found = road.agree(normal, np.zeros_like(told.columns), told, found)
+        told, found = road.nodded(told, found)
+    return told
+
+
+@pytest.mark.parametrize("off", [-12.0, 12.0])
+def test_bent_boundaries_tell_where_the_horizon_is(off: float) -> None:
+    told = nodded(boundaries(on_road(-2.4, -1.2, 1.1, 3.0), HORIZON + off), CommonRoad(usual=(0.1, 0.1, 0.1)))
+    assert abs(told.horizon - HORIZON) < 3.0
+    assert np.abs(told.coefficients[:, 2] - BEND).max() < 0.3 * BEND
+
+
+def test_horizon_is_not_taken_to_be_farther_away_than_cameras_nod() -> None:
+    told = boundaries(on_road(-2.4, -1.2, 1.1, 3.0), HORIZON + 50.0)
+    assert nodded(told, CommonRoad(usual=(0.1, 0.5, 0.1))).horizon == pytest.approx(HORIZON + 50.0 - 0.04 * DEPTH)
+    assert nodded(told, CommonRoad(nod=0.0)).horizon == HORIZON + 50.0

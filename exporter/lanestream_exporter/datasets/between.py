@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 
+from lanestream.detection.commonroad import CommonRoad
 from lanestream.detection.refinement import Refinement
 from lanestream.errors import LabelError
 from lanestream.geometry import RoadView
@@ -48,7 +49,7 @@ class Between:
     stride: int = 5
     longest: int = 60
     agreement: float = 6.0
-    refinement: Refinement = Refinement()
+    refinement: Refinement = Refinement(road=CommonRoad(nod=0.0))
 
     def frames(self, video: Path, labelled: Mapping[int, LabelledFrame]) -> Iterator[tuple[LabelledFrame, Image]]:
         """Labelled frames between those of `labelled`, by index in the video, with their BGR images (H, W, 3).
@@ -99,7 +100,8 @@ class Between:
                 Candidate(_under(curve, moment.view), max(top, moment.view.row_at(_TOP_SHARE)), bottom, 1.0)
                 for curve, (top, bottom) in zip(followed[-1], moment.spans, strict=True)
             ]
-            followed.append([fit.curve for fit in self.refinement.refine(image, candidates, moment.view)])
+            fits, _ = self.refinement.refine(image, candidates, moment.view)
+            followed.append([fit.curve for fit in fits])
         return followed
 
     def _label(

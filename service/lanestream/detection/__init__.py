@@ -201,13 +201,15 @@ def beside(steps: Steps[T], work: Callable[[], U]) -> Steps[tuple[T, U]]:
 class Pipeline:
     """A detector with the network that answers it, by the name that users ask for it.
 
-    A `glance` at the whole road, with a network of its own, tells the detector where to look; it can do without.
+    A `glance` at the whole road, with a network of its own, tells the detector where to look; it can do without. Of a
+    frame whose horizon is not known, `first_look` finds it before all else, where there is one.
     """
 
     name: DetectorName
     detector: LaneDetector
     network: Network
     glance: RoadGlance | None = None
+    first_look: RoadGlance | None = None
 
     def prepare(
         self,
@@ -221,6 +223,8 @@ class Pipeline:
         `glanced` is the horizon's row that the glance at the frame before saw. It is steadier than `horizon`, which
         what is found on the road moves about, and a glance at the right place needs no second one.
         """
+        if self.first_look is not None and horizon is None:
+            horizon = (yield from self.first_look.look(image)).view.horizon
         if self.glance is None:
             return self.detector.prepare(image, horizon, expected)
         looking = self.glance.look(image, horizon if glanced is None else glanced)

@@ -6,31 +6,47 @@ dashed line that shows no bend of its own, or one whose far end is behind a car,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.lanes import FloatArray, curve_basis
 
 
 @dataclass(frozen=True)
 class Boundaries:
-    """N boundaries as their `columns` (N, 3) at three rows.
+    """N boundaries as their `columns` (N, 3) at three `rows` (3,), told below a `horizon`.
 
-    `to_curve` (3, 3) takes those columns to the coefficients v, b and k of a curve. `leaning` (N,) is how much wider a
-    boundary's errors are from side to side than those of an upright one; `depth` is the rows below the horizon.
+    The row at which it was `expected` is kept beside it. `leaning` (N,) is how much wider a boundary's errors are from
+    side to side than those of an upright one; `depth` is the rows below the expected horizon.
     """
 
     columns: FloatArray
-    to_curve: FloatArray
+    rows: FloatArray
+    horizon: float
+    expected: float
     leaning: FloatArray
     depth: float
+
+    @cached_property
+    def to_curve(self) -> FloatArray:
+        """The matrix (3, 3) that takes columns at the rows to the coefficients v, b and k of a curve."""
+        return np.asarray(np.linalg.inv(curve_basis(self.horizon, self.rows)))
 
     @cached_property
     def coefficients(self) -> FloatArray:
         """The curves' coefficients v, b and k (N, 3)."""
         return np.asarray(self.columns @ self.to_curve.T)
+
+    def drift(self, shifts: FloatArray) -> FloatArray:
+        """How v, b and k (N, 3) of the boundaries, moved by `shifts` (N, 3), change with each row of the horizon.
+
+        The columns stay where they are: a lower horizon is to a curve as if its points were that much higher.
+        """
+        _, b, k = ((self.columns + shifts) @ self.to_curve.T).T[:, :, None]
+        slopes = b - k / (self.rows - self.horizon) ** 2
+        return np.asarray(slopes @ self.to_curve.T)
 
 
 @dataclass(frozen=True)
@@ -38,7 +54,7 @@ class Agreement:
     """Shifts (N, 3) of boundaries' columns, with covariances (N, 3, 3), and the road (3,) that they agree on.
 
     The road is told by its vanishing point's column V, by the rows H that its horizon is lower than the one that
-    boundaries are told below, and by its bend K over the depth.
+    boundaries are told below, and by its bend K over the depth, V and K below its own horizon.
     """
 
     shifts: FloatArray
@@ -52,18 +68,20 @@ class CommonRoad:
 
     The v and k of a boundary are those of the road give or take `vanishing` and `bend`; one that is `outlier` times
     that away counts half, because it is of another road, or no boundary. Of the road it is known beforehand that its
-    V, H and K are those of the median boundary give or take `usual`.
+    V and K are those of the median boundary, and its horizon where it was expected, give or take `usual`; the horizon
+    is not taken to be more than `nod` away.
     """
 
     vanishing: float = 0.003
     bend: float = 0.0006
     outlier: float = 3.0
     usual: tuple[float, float, float] = (0.1, 0.03, 0.03)
+    nod: float = 0.04
 
     def begun(self, boundaries: Boundaries) -> Agreement:
-        """Boundaries that have not moved, and the road of the median one."""
+        """Boundaries that have not moved, and the road of the median one below the expected horizon."""
         v, _, k = np.median(boundaries.coefficients, axis=0)
-        road = np.array([v, 0.0, k / boundaries.depth])
+        road = np.array([v, boundaries.expected - boundaries.horizon, k / boundaries.depth])
         return Agreement(np.zeros_like(boundaries.columns), np.zeros((*boundaries.columns.shape, 3)), road)
 
     def agree(self, normal: FloatArray, moment: FloatArray, boundaries: Boundaries, last: Agreement) -> Agreement:
@@ -71,12 +89,14 @@ class CommonRoad:
 
         What each boundary says by itself are the normal equations of its shift: `normal` (N, 3, 3), `moment` (N, 3).
         """
-        v, b, k = boundaries.coefficients.T
-        # Two ties a boundary: v + its shift = V - b H, and k likewise = K.
+        v, _, k = boundaries.coefficients.T
+        drift_v, _, drift_k = boundaries.drift(last.shifts).T
+        # Two ties a boundary: v + its shift + its drift H = V, and k likewise = K.
         ties = boundaries.to_curve[[0, 2]] / np.array([[1.0], [boundaries.depth]])
         told = np.stack([v, k / boundaries.depth], axis=1)
         shared = np.zeros((len(v), 2, 3))
-        shared[:, 0, 0], shared[:, 0, 1], shared[:, 1, 2] = 1.0, -b, 1.0
+        shared[:, 0, 0], shared[:, 0, 1] = 1.0, -drift_v
+        shared[:, 1, 1], shared[:, 1, 2] = -drift_k / boundaries.depth, 1.0
         sigma = boundaries.depth * boundaries.leaning[:, None] * np.array([self.vanishing, self.bend])
         away = (told + last.shifts @ ties.T - shared @ last.road) / sigma
         weight = sigma**-2.0 / (1.0 + (away**2).sum(axis=1, keepdims=True) / self.outlier**2)
@@ -91,3 +111,10 @@ class CommonRoad:
         road = spread @ (prior @ first + np.einsum("nij,nj->i", known, told + alone @ ties.T))
         covariances = own + follows @ spread @ follows.swapaxes(1, 2)
         return Agreement(alone + follows @ road, covariances, road)
+
+    def nodded(self, boundaries: Boundaries, found: Agreement) -> tuple[Boundaries, Agreement]:
+        """The same boundaries and what they agreed on, told below the horizon of their road."""
+        most = self.nod * boundaries.depth
+        low = float(np.clip(boundaries.horizon + found.road[1] - boundaries.expected, -most, most))
+        road = np.array([found.road[0], 0.0, found.road[2]])
+        return replace(boundaries, horizon=boundaries.expected + low), replace(found, road=road)

@@ -77,15 +77,15 @@ class CandidateDetector:
         away = np.abs(_gaps([candidate.curve for candidate in candidates], prepared.view)).max(axis=2)
         chosen = _kept(away > self.same)
         together = self._together(candidates, told[accepted], away, chosen, prepared.view)
-        fits = self.refinement.refine(prepared.image, together, prepared.view)
-        spans = visible_spans([fit.curve for fit in fits], prepared.view, TOP_SHARE)
+        fits, view = self.refinement.refine(prepared.image, together, prepared.view)
+        spans = visible_spans([fit.curve for fit in fits], view, TOP_SHARE)
         detections = [
             Detection(fit.curve, fit.covariance, *span, float(probability[accepted[i]]))
             for i, fit, span in zip(chosen, fits, spans, strict=True)
             if span is not None
         ]
         detections.sort(key=lambda detection: -detection.probability)
-        return Findings(tuple(self._apart(detections, prepared.view)), prepared.view, prepared.horizon_weight)
+        return Findings(tuple(self._apart(detections, view)), view, prepared.horizon_weight)
 
     @staticmethod
     def judged(prepared: Prepared, outputs: NDArray[np.float32]) -> FloatArray:

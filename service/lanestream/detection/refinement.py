@@ -8,7 +8,7 @@ the road that it shares with the others: a dashed marking keeps its direction, a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -25,6 +25,9 @@ USUAL_LEANING: Final = 1.6
 
 # A strip's best bars are those of the best tenth of its rows.
 _BEST_ROWS: Final = 0.1
+
+# Nearer to the horizon than this, in depths, a bend has no bounds, and paint tells nothing of it.
+_FARTHEST: Final = 0.04
 
 
 @dataclass(frozen=True)
@@ -63,13 +66,13 @@ class Refinement:
 
     def refine(
         self, image: Image, candidates: Sequence[Candidate], view: RoadView, doubts: FloatArray | None = None
-    ) -> list[Fit]:
-        """A fit for each candidate of a BGR image (H, W, 3).
+    ) -> tuple[list[Fit], RoadView]:
+        """A fit for each candidate of a BGR image (H, W, 3), and `view` with the horizon that they agree on.
 
         `doubts` (N, 3) are how far off each candidate may be at the `anchors`, in pixels, where that is known.
         """
         if not candidates:
-            return []
+            return [], view
         curves = [candidate.curve for candidate in candidates]
         spans = [
             span or (candidate.top, candidate.bottom)
@@ -121,33 +124,39 @@ class Refinement:
         sides = cv2.copyMakeBorder(mean, 0, 0, width, width, cv2.BORDER_REPLICATE)
         return np.asarray(mean - np.maximum(sides[:, : -2 * width], sides[:, 2 * width :]), dtype=np.float32)
 
-    def _fits(self, along: _Along, bars: NDArray[np.float32], view: RoadView, doubts: FloatArray) -> list[Fit]:
+    def _fits(
+        self, along: _Along, bars: NDArray[np.float32], view: RoadView, doubts: FloatArray
+    ) -> tuple[list[Fit], RoadView]:
         """Columns at the anchor rows by least squares with the curves so far, and the road they share, as the prior."""
         anchors = view.horizon + np.asarray(self.anchors) * view.depth
-        to_curve = np.asarray(np.linalg.inv(curve_basis(view.horizon, anchors)), dtype=float)
-        basis = curve_basis(view.horizon, along.y) @ to_curve
-        leaning = along.leaning[:, None]
-        sigma = self.noise * view.width / 640.0 + self.blur * along.below
+        columns = curve_columns(along.curves, anchors)
+        boundaries = Boundaries(columns, anchors, view.horizon, view.horizon, along.leaning, view.depth)
         prior = np.eye(3) / doubts[:, None] ** 2
         # Sums over a strip's cells, and sums of where they are, in one product.
-        across = self._across()
-        sums = np.stack([np.ones_like(across), across], axis=1)
-        boundaries = Boundaries(curve_columns(along.curves, anchors), to_curve, along.leaning, view.depth)
+        sums = np.stack([np.ones(self.cells, np.float32), self._across()], axis=1)
         found, normal = self.road.begun(boundaries), prior
         for reach in self.steps:
-            seen = (basis @ found.shifts[:, :, None])[:, :, 0] / (along.below * leaning)
-            off = (across - seen.astype(np.float32)[:, :, None]) * np.float32(1.0 / reach)
+            basis = curve_basis(boundaries.horizon, along.y) @ boundaries.to_curve
+            seen = along.places((basis @ (columns + found.shifts)[:, :, None])[:, :, 0])
+            off = (self._across() - seen.astype(np.float32)[:, :, None]) * np.float32(1.0 / reach)
             total, moment = np.moveaxis((bars / (1.0 + off * off) ** 2) @ sums, 2, 0).astype(np.float64)
-            centre = moment / np.maximum(total, 1e-6) * along.below * leaning
+            away = along.columns(moment / np.maximum(total, 1e-6)) - (basis @ columns[:, :, None])[:, :, 0]
             # A row counts once, however wide its bar; a row without a bar does not count.
-            trusted = basis.swapaxes(1, 2) * (np.minimum(total / 2.0, 1.0) / sigma**2)[:, None]
+            trust = np.minimum(total / 2.0, 1.0) * (along.y - boundaries.horizon > _FARTHEST * view.depth)
+            trusted = basis.swapaxes(1, 2) * (trust / self._sigma(along, view) ** 2)[:, None]
             normal = prior + trusted @ basis
-            found = self.road.agree(normal, (trusted @ centre[:, :, None])[:, :, 0], boundaries, found)
+            found = self.road.agree(normal, (trusted @ away[:, :, None])[:, :, 0], boundaries, found)
+            boundaries, found = self.road.nodded(boundaries, found)
         # Neighbouring rows share their errors: about four of them are worth one.
         worth = self.road.agree(prior + (normal - prior) / 4.0, np.zeros_like(found.shifts), boundaries, found)
-        covariances = to_curve @ worth.covariances @ to_curve.T
-        curves = curves_through(view.horizon, anchors, boundaries.columns + found.shifts)
-        return [Fit(curve, covariance) for curve, covariance in zip(curves, covariances, strict=True)]
+        covariances = boundaries.to_curve @ worth.covariances @ boundaries.to_curve.T
+        curves = curves_through(boundaries.horizon, anchors, columns + found.shifts)
+        fits = [Fit(curve, covariance) for curve, covariance in zip(curves, covariances, strict=True)]
+        return fits, replace(view, horizon=boundaries.horizon)
+
+    def _sigma(self, along: _Along, view: RoadView) -> FloatArray:
+        """How exactly a bar's centre is known on each row (N, R), in pixels."""
+        return self.noise * view.width / 640.0 + self.blur * along.below
 
 
 @dataclass(frozen=True)
@@ -172,3 +181,11 @@ class _Along:
         slope = [float(curve.slope(middle)) for curve, middle in zip(curves, 0.5 * (top + bottom), strict=True)]
         leaning = np.maximum(1.0, np.hypot(1.0, slope) / USUAL_LEANING)
         return cls(tuple(curves), y, curve_columns(curves, y), y - view.horizon, leaning)
+
+    def places(self, x: FloatArray) -> FloatArray:
+        """Where the columns `x` (N, R) are in the strips: beside the curves, in rows below the horizon by leaning."""
+        return (x - self.x) / (self.below * self.leaning[:, None])
+
+    def columns(self, places: FloatArray) -> FloatArray:
+        """The columns (N, R) that are at `places` in the strips."""
+        return self.x + places * self.below * self.leaning[:, None]

@@ -154,7 +154,7 @@ class RegressionDetector:
         ]
         sides = [side for side, _ in seen]
         doubts = np.maximum(self.doubt * view.width * reading.deviations[sides], _EXACT * view.depth)
-        fits = self.refinement.refine(prepared.image, [candidate for _, candidate in seen], view, doubts)
+        fits, view = self.refinement.refine(prepared.image, [candidate for _, candidate in seen], view, doubts)
         spans = visible_spans([fit.curve for fit in fits], view, _TOP_SHARE)
         detections = [
             Detection(fit.curve, fit.covariance, *span, float(reading.presence[side]))
