@@ -17,6 +17,7 @@ from lanestream_exporter.evaluation.bootstrap import blocks, intervals, measured
 from lanestream_exporter.evaluation.boundaries import Found, match, match_ego
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
+from lanestream_exporter.evaluation.lateral import lateral_figures
 from lanestream_exporter.evaluation.outcomes import RULES, Outcome, judge
 from lanestream_exporter.evaluation.steadiness import steadiness
 
@@ -86,6 +87,19 @@ def test_boundary_figures_of_two_frames() -> None:
     assert len(seen) >= 9
     assert seen == pytest.approx([off / 3.0] * len(seen), abs=0.05)
     assert sum(ego["error_by_depth"]["samples"]) == 3 * 58  # of 64 rows, those below row 280
+
+
+def test_lateral_errors_by_the_formula_and_straight_on() -> None:
+    bent = Curve(200.0, (640.0, -1.1, 2000.0))
+    outcomes = [Outcome(frame(*PAIR, number=i), (Found(bent, 280.0, 719.0, -1), found(1.1, 1))) for i in range(2)]
+    near, far = (lateral_figures(outcomes)[place] for place in ("10m", "30m"))
+    row = 200.0 + 0.5 / np.tan(np.deg2rad(32.5)) * 1280 * 1.45 / 30.0
+    assert (far["labelled"], far["told"], far["reached"]) == (4, 4, 0)
+    assert far["mean_px_640"] == pytest.approx(0.5 * 0.5 * 2000.0 / (row - 200.0), rel=0.02)
+    straight = 2000.0 / 80.0 - (row - 280.0) * 2000.0 / 80.0**2
+    assert far["straight_px_640"] == pytest.approx(0.5 * 0.5 * straight, rel=0.02)
+    assert near["reached"] == 4
+    assert near["mean_px_640"] == near["straight_px_640"]
 
 
 def test_figures_of_nothing_are_null() -> None:
@@ -214,6 +228,21 @@ def test_a_stripe_matches_one_label_and_a_short_one_none() -> None:
 def test_stripes_are_matched_so_that_most_overlaps() -> None:
     """The nearest pair first would leave 495 with 512, too far apart."""
     assert counts([upright(505.0), upright(495.0)], [upright(502.0), upright(512.0)]) == (2, 0, 0)
+
+
+def test_of_the_ego_pair_nothing_else_counts() -> None:
+    outer = label(3.0)
+    outcomes = [
+        Outcome(frame(*PAIR, outer), (found(-1.1, -1), found(1.1, 1), found(2.2, 2))),
+        Outcome(frame(label(3.0, position=2)), (found(1.1, 1),)),
+    ]
+    figures = field_figures(outcomes)
+    assert (figures["tusimple"]["frames"], figures["tusimple"]["labels"]) == (2, 4)
+    assert figures["tusimple"]["fp"] == pytest.approx(0.5 * (1.0 / 3.0 + 1.0), abs=1e-4)
+    ego = figures["ego"]
+    assert (ego["tusimple"]["frames"], ego["tusimple"]["labels"]) == (1, 2)
+    assert (ego["tusimple"]["fp"], ego["tusimple"]["fn"]) == (0.0, 0.0)
+    assert (ego["culane"]["tp"], ego["culane"]["fp"], ego["culane"]["fn"]) == (2, 0, 0)
 
 
 def test_field_figures_over_a_set() -> None:

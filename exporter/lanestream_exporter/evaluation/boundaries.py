@@ -41,6 +41,11 @@ class Found:
         """What a frame's result says of one boundary."""
         return cls(lane.curve, lane.top, lane.bottom, lane.position, lane.track_id)
 
+    def straight_on(self, rows: FloatArray) -> FloatArray:
+        """Columns at `rows`; above its `top` it goes on straight as it ends."""
+        beyond = np.minimum(rows - self.top, 0.0)
+        return np.asarray(self.curve.x(np.maximum(rows, self.top)) + self.curve.slope(self.top) * beyond)
+
 
 @dataclass(frozen=True)
 class Pair:

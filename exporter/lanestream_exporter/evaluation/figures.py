@@ -12,7 +12,7 @@ from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation import culane, tusimple
 from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
 from lanestream_exporter.evaluation.boundaries import Verdict, errors_along, match, match_ego
-from lanestream_exporter.evaluation.outcomes import Outcome
+from lanestream_exporter.evaluation.outcomes import Outcome, ego_pair
 
 _SHARES = 10  # bins of the error against depth
 
@@ -29,8 +29,13 @@ def match_all(outcome: Outcome) -> Verdict:
 
 
 def field_figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Level C: TuSimple's and CULane's metrics; see docs/evaluation.md."""
-    return {"tusimple": _tusimple(outcomes), "culane": _culane(outcomes)}
+    """Level C: TuSimple's and CULane's metrics, of all lanes and of the ego pair; see docs/evaluation.md."""
+    pairs = [pair for outcome in outcomes if (pair := ego_pair(outcome)).frame.lanes]
+    return {
+        "tusimple": _tusimple(outcomes),
+        "culane": _culane(outcomes),
+        "ego": {"tusimple": _tusimple(pairs), "culane": _culane(pairs)},
+    }
 
 
 def _matched(outcomes: Sequence[Outcome], verdicts: Sequence[Verdict]) -> dict[str, Any]:

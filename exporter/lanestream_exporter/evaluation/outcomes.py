@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,13 @@ class Outcome:
     frame: LabelledFrame
     found: tuple[Found, ...]
     candidates: JudgedCandidates | None = None
+
+
+def ego_pair(outcome: Outcome) -> Outcome:
+    """The same frame without all that is neither labelled nor reported as a boundary of the ego lane."""
+    lanes = tuple(lane for lane in ego_sides(outcome.frame) if lane is not None)
+    found = tuple(boundary for boundary in outcome.found if abs(boundary.position) == 1)
+    return Outcome(replace(outcome.frame, lanes=lanes), found)
 
 
 def judge(prepared: Prepared, outputs: NDArray[np.float32], wide: Prepared, frame: LabelledFrame) -> JudgedCandidates:

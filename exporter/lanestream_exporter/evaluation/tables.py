@@ -12,7 +12,8 @@ from rich.text import Text
 # The cells of a row, from a method's figure groups of a drive; none where it has no such figures.
 Values = Callable[[Mapping[str, Any]], list[float | None]]
 
-_LATERAL = ("10 m", "ratio", "30 m", "ratio")
+_LATERAL = ("10 m", "ratio", "30 m", "ratio", "straight on")
+_FIELD = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
 _JUDGED = ("base rate", "P", "R", "Acc", "AP")
 _DECIDED = (*_JUDGED, "ego prop.", "all prop.")
 _BOUNDARIES = ("ego P", "ego R", "ego F1", "px", "all P", "all R", "all F1")
@@ -30,7 +31,8 @@ def tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     yield _table(
         "Lateral error of the ego pair, px at 640 wide, and over a constant answer's", _LATERAL, images, _lateral
     )
-    yield _table("C. The field's metrics", ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5"), images, _field)
+    yield _table("C. The field's metrics", _FIELD, images, lambda groups: _field(groups["field"]))
+    yield _table("C. The same of the ego pair alone", _FIELD, images, lambda groups: _field(groups["field"]["ego"]))
 
 
 def _candidates(groups: Mapping[str, Any]) -> list[float | None]:
@@ -60,11 +62,12 @@ def _boundaries(part: Mapping[str, Any]) -> list[float | None]:
 
 
 def _lateral(groups: Mapping[str, Any]) -> list[float | None]:
-    return [groups["lateral"][place][key] for place in ("10m", "30m") for key in ("mean_px_640", "ratio")]
+    near, far = groups["lateral"]["10m"], groups["lateral"]["30m"]
+    return [near["mean_px_640"], near["ratio"], far["mean_px_640"], far["ratio"], far["straight_ratio"]]
 
 
-def _field(groups: Mapping[str, Any]) -> list[float | None]:
-    tusimple, culane = groups["field"]["tusimple"], groups["field"]["culane"]
+def _field(part: Mapping[str, Any]) -> list[float | None]:
+    tusimple, culane = part["tusimple"], part["culane"]
     return [tusimple["accuracy"], tusimple["fp"], tusimple["fn"], culane["f1"]]
 
 
