@@ -30,7 +30,8 @@ def main(path: Path) -> None:
         ("B. The same frames without", _BOUNDARIES, _rows(clips, lambda groups: _boundaries(groups["alone"]))),
         ("Steadiness", _STEADY, _rows(clips, _steady)),
         ("Lateral error", _LATERAL, _rows(images, _lateral)),
-        ("C. The field's metrics", _FIELD, _rows(images, _field)),
+        ("C. The field's metrics", _FIELD, _rows(images, lambda groups: _field(groups["field"]))),
+        ("C. Of the ego pair alone", _FIELD, _rows(images, lambda groups: _field(groups["field"]["ego"]))),
     ):
         click.echo(f"\n**{title}**\n")
         for row in (("", *head), ["---"] * (len(head) + 1), *rows):
@@ -41,7 +42,7 @@ _CANDIDATES = ("precision", "recall", "accuracy", "average precision", "base rat
 _PROPOSED = ("ego, 8", "ego, 16", "ego, 32", "all, 8", "all, 16", "all, 32")
 _BOUNDARIES = ("ego precision", "ego recall", "ego error, px", "all precision", "all recall")
 _STEADY = ("both ego boundaries", "jitter, px", "identity switches")
-_LATERAL = ("10 m, px", "of a constant's", "30 m, px", "of a constant's")
+_LATERAL = ("10 m, px", "of a constant's", "30 m, px", "of a constant's", "told so far", "straight on")
 _FIELD = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
 
 
@@ -118,11 +119,12 @@ def _lateral(groups: Groups) -> list[str]:
             f"{_pixels(part['mean_px_640'])} ({part['told']} of {part['labelled']})",
             f"{_share(part['ratio'])}{_interval(part, 'ratio')}",
         ]
-    return cells
+    far = groups["lateral"]["30m"]
+    return [*cells, str(far["reached"]), f"{_share(far['straight_ratio'])}{_interval(far, 'straight_ratio')}"]
 
 
-def _field(groups: Groups) -> list[str]:
-    tusimple, culane = groups["field"]["tusimple"], groups["field"]["culane"]
+def _field(part: Groups) -> list[str]:
+    tusimple, culane = part["tusimple"], part["culane"]
     return [
         f"{_share(tusimple['accuracy'])}{_interval(tusimple, 'accuracy')}",
         _share(tusimple["fp"]),
