@@ -66,6 +66,7 @@ def _times(axes: Axes, told: Mapping[str, Any]) -> None:
         axes.vlines(place, cell["p50_ms"], cell["p95_ms"], color="black", linewidth=1.2)
         axes.annotate(f"{cell['p50_ms']:.0f}", (place, cell["p95_ms"]), (0, 3), textcoords="offset points", ha="center")
     axes.set_xticks(range(len(rows)), [_LOOKS[name][0].replace(" ", "\n", 1) for name, _ in rows], fontsize=8)
+    axes.margins(y=0.12)  # room for the highest bar's number
     axes.set(title="One camera: lower is better", ylabel="ms from frame to reply: median, and p95")
     axes.grid(alpha=0.3, axis="y")
 
