@@ -22,6 +22,10 @@ from lanestream_exporter.roadframes import RoadFrame
 # The shares of the depth at which errors are counted.
 SHARES: Final = (1.0, 0.8, 0.62, 0.48, 0.37, 0.28, 0.21, 0.16, 0.12)
 
+# How strongly roads are bent, and how often so: motorways bend by a hundredth of the depth, mountain roads by a tenth.
+_BENDS: Final = (0.012, 0.03, 0.08)
+_BENT: Final = (0.6, 0.3, 0.1)
+
 # Above this share of the depth a bend is not followed: it would tear the picture apart at the horizon.
 _BENT_FROM: Final = 0.05
 
@@ -63,7 +67,7 @@ class Warp:
             pan=rng.normal(0.0, 0.06),
             side=rng.normal(0.0, 0.15),
             zoom=float(np.exp(rng.normal(0.0, 0.12))),
-            bend=rng.normal(0.0, 0.012) if rng.random() < 0.7 else rng.normal(0.0, 0.03),
+            bend=rng.normal(0.0, rng.choice(_BENDS, p=_BENT)),
             assumed=rng.uniform(-0.25, 0.25) if far_off else rng.normal(0.0, 0.02),
             flipped=bool(rng.random() < 0.5),
         )

@@ -62,6 +62,14 @@ def test_alone_a_boundary_is_its_own_road() -> None:
     assert np.abs(found.shifts).max() < 1e-6
 
 
+def test_in_a_sharp_bend_the_inner_boundary_may_turn_more_sharply() -> None:
+    bends = (0.9 * 12_000.0, 12_000.0, 1.1 * 12_000.0)
+    told = boundaries([Curve(HORIZON, (VANISHING, b, k)) for b, k in zip((-2.0, 0.0, 2.0), bends, strict=True)])
+    found = agreed(told, np.full((3, 3), 4.0))
+    assert np.abs(found.shifts).max() < 1.5
+    assert abs(found.road[2] - 12_000.0 / DEPTH) < 1.5
+
+
 def test_common_horizon_explains_lines_that_meet_below_it() -> None:
     # Straight lines that meet 8 rows below the assumed horizon: v = V - 8 b.
     told = boundaries([Curve(HORIZON, (VANISHING - 8.0 * b, b, 0.0)) for b in (-2.0, -0.8, 1.0, 2.5)])

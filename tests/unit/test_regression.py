@@ -166,6 +166,20 @@ def test_labels_tell_the_horizon_they_share() -> None:
     assert shared_horizon([], HEIGHT, 140.0) == 140.0
 
 
+def test_a_road_unlike_the_model_keeps_the_horizon_of_its_drive() -> None:
+    lanes = [points(LEFT), points(RIGHT)]
+    # What the model describes, it is believed, even where the drive says otherwise.
+    assert shared_horizon(lanes, HEIGHT, HORIZON + 8.0) == pytest.approx(HORIZON, abs=1.0)
+    # A sharp bend that begins far ahead, its inner boundary more bent than its outer one.
+    for lane, bend in zip(lanes, (2e4, 6e4), strict=True):
+        lane[:, 0] += bend / (lane[:, 1] - HORIZON + 10.0) ** 2
+    alone = shared_horizon(lanes, HEIGHT, None)
+    told = shared_horizon(lanes, HEIGHT, HORIZON)
+    assert alone is not None
+    assert abs(alone - HORIZON) > 8.0
+    assert told == pytest.approx(HORIZON, abs=4.0)
+
+
 @pytest.mark.parametrize(
     "warp",
     [

@@ -12,11 +12,13 @@ import pytest
 
 from lanestream_exporter.scenes import Drive, render_clip, render_still, sample_clip, sample_scene, write_clip
 from lanestream_exporter.scenes.camera import Camera
+from lanestream_exporter.scenes.dice import Dice
 from lanestream_exporter.scenes.lens import Bonnet, Lens
 from lanestream_exporter.scenes.light import Air, Light
 from lanestream_exporter.scenes.markings import Paintwork
 from lanestream_exporter.scenes.road import Boundary, Course, Marking, Pose, Road
 from lanestream_exporter.scenes.roadside import Wall
+from lanestream_exporter.scenes.sampling import sample_course
 from lanestream_exporter.scenes.surface import Material, Surface
 from lanestream_exporter.scenes.traffic import Vehicle
 from lanestream_exporter.scenes.view import Grid, RoadView
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lanestream_exporter.scenes import Clip, Scene
+    from lanestream_exporter.scenes.layout import Style
 
 LINE = Marking("solid", "white", width=0.3, brightness=0.95, wear=0.0)
 GREY = Material(-70.0, 70.0, (0.3, 0.3, 0.3), 1.0)
@@ -150,6 +153,20 @@ def test_sampled_labels_are_inside_ordered_and_exhaustive(seed: int) -> None:
         assert lane.lane_id is not None
     positions = [lane.position or 0 for lane in frame.labels.lanes]
     assert positions == sorted(set(positions))
+
+
+def test_country_roads_turn_as_sharply_as_mountain_roads_and_motorways_as_motorways() -> None:
+    dice = Dice(np.random.default_rng(3))
+
+    def radii(style: Style) -> NDArray[np.float64]:
+        courses = [sample_course(dice, style, 260.0) for _ in range(100)]
+        return 1.0 / np.maximum([np.abs(course.curvatures).max() for course in courses], 1e-9)
+
+    country, motorway = radii("country"), radii("highway")
+    assert 30.0 <= country.min() < 40.0
+    assert 40.0 < np.median(country) < 120.0
+    assert 250.0 <= motorway.min() < 350.0
+    assert country.max() > 10_000.0  # straight
 
 
 def test_the_same_seed_gives_the_same_frame_and_another_a_different_one() -> None:

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from lanestream.lanes import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
 
+# How far a frame's horizon is usually from its drive's, as a share of the height: cameras nod, and roads rise and fall.
+_NOD: Final = 0.007
+
+# Points of a label share their errors: so many of a lane's are worth one each, and none is exact to less than a pixel.
+_WORTH: Final = 4.0
+
 
 def shared_horizon(lanes: Sequence[FloatArray], height: int, expected: float | None) -> float | None:
     """The row under which all boundaries keep to one vanishing point and one bend; None where that can't be told.
 
     `lanes` are polylines (N, 2). The model is x = v + b (y - h) + k / (y - h) with v, h and k shared; `expected` is
-    about h, where it is known, and draws the answer to it by half where only one boundary is labelled.
+    about h, where it is known. A road that the model describes badly, because its bend changes or because it is a hill,
+    says little of h: its points count for as much less as they are off.
     """
     lowest = min((float(lane[:, 1].min()) for lane in lanes), default=0.0)
     rows = np.arange(0.15 * height, min(lowest, 0.8 * height) - 1.0, 0.5)
@@ -22,8 +30,9 @@ def shared_horizon(lanes: Sequence[FloatArray], height: int, expected: float | N
         rows = rows[np.abs(rows - expected) <= 0.08 * height]
     if not lanes or (len(lanes) < 2 and expected is None) or not len(rows):
         return expected
-    spread = 0.03 * height
-    costs = [_misfit(lanes, h) + (0.0 if expected is None else ((h - expected) / spread) ** 2) for h in rows]
+    costs = np.array([_misfit(lanes, row) for row in rows])
+    if expected is not None:
+        costs = costs / max(1.0, costs.min() / (_WORTH * len(lanes))) + ((rows - expected) / (_NOD * height)) ** 2
     return float(rows[int(np.argmin(costs))])
 
 
@@ -39,13 +48,13 @@ def drive_horizons(frames: Sequence[LabelledFrame]) -> list[float | None]:
 
 
 def _misfit(lanes: Sequence[FloatArray], horizon: float) -> float:
-    """Squared residuals of all lanes under the shared model, each point to about a pixel."""
+    """Squared residuals of all lanes under the shared model, in pixels."""
     blocks, targets = [], []
     for index, lane in enumerate(lanes):
         u = lane[:, 1] - horizon
         own = np.zeros((len(u), len(lanes)))
         own[:, index] = u
-        weight = np.sqrt(20.0 / len(u))
+        weight = np.sqrt(_WORTH / len(u))
         blocks.append(weight * np.hstack([np.ones((len(u), 1)), 100.0 / u[:, None], own]))
         targets.append(weight * lane[:, 0])
     design, target = np.concatenate(blocks), np.concatenate(targets)

@@ -30,10 +30,11 @@ if TYPE_CHECKING:
 
 STILL_LENGTH = 260.0  # metres of road that a still can see
 START = 20.0  # s of the vehicle at the start, metres: a little road lies behind it
-KNOT_SPACING = 40.0  # metres between knots of curvature
 
 STYLES: dict[Style, float] = {"highway": 0.52, "country": 0.27, "street": 0.14, "lane": 0.07}
-SHARPEST: dict[Style, float] = {"highway": 1 / 450, "country": 1 / 70, "street": 1 / 150, "lane": 1 / 60}  # 1/m
+SHARPEST: dict[Style, float] = {"highway": 1 / 250, "country": 1 / 30, "street": 1 / 60, "lane": 1 / 30}  # 1/m
+CREST: dict[Style, float] = {"highway": 1.5e-4, "country": 6e-4, "street": 4e-4, "lane": 6e-4}  # usual vertical, 1/m
+KNOT_SPACING: dict[Style, float] = {"highway": 40.0, "country": 20.0, "street": 25.0, "lane": 20.0}  # of curvature, m
 
 
 @dataclass(frozen=True)
@@ -98,14 +99,15 @@ def sample_camera(dice: Dice, size: tuple[int, int]) -> Camera:
 
 def sample_course(dice: Dice, style: Style, length: float) -> Course:
     """A course whose curvature wanders; straight roads are as common as they are outside."""
-    knots = int((length + 2.0 * START) / KNOT_SPACING) + 2
+    spacing = KNOT_SPACING[style]
+    knots = int((length + 2.0 * START) / spacing) + 2
     sharpest = 0.0 if dice.chance(0.15) else SHARPEST[style] * dice.between(0.1, 1.0)
     value, values = dice.around(0.6 * sharpest), []
     for _ in range(knots):
         values.append(float(np.clip(value, -sharpest, sharpest)))
         value = 0.75 * value + dice.around(0.5 * sharpest)
-    bend = 0.0 if dice.chance(0.4) else dice.around(1.2e-4 if style == "highway" else 3.5e-4)
-    return Course(KNOT_SPACING, tuple(values), bend)
+    bend = 0.0 if dice.chance(0.4) else dice.around(CREST[style])
+    return Course(spacing, tuple(values), bend)
 
 
 def _pose(dice: Dice, layout: Layout) -> Pose:
@@ -131,8 +133,8 @@ def _air(dice: Dice, weather: Weather, skyline: Colour) -> Air:
 
 def sample_lens(dice: Dice, weather: Weather) -> Lens:
     """A camera's settings and faults: most pictures are good, some are poor in one or two ways."""
-    dark = dice.chance(0.07) and not weather.night
-    exposure = dice.between(0.18, 0.45) if dark else dice.between(0.75, 1.25)
+    dark = dice.chance(0.1) and not weather.night
+    exposure = dice.between(0.1, 0.45) if dark else dice.between(0.75, 1.25)
     glare = None
     if dice.chance(0.1):
         glare = Glare(dice.between(0.0, 1.0), dice.between(0.0, 0.5), dice.between(0.1, 0.4), dice.between(0.15, 0.6))

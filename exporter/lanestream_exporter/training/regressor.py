@@ -29,7 +29,7 @@ _TOLD = {"10m": SHARES.index(0.37), "30m": SHARES.index(0.12)}
 class FrameData(PatchData):
     """Where frames come from, and which share of each batch is real: `final_real_share` in the last third."""
 
-    rendered_scenes: NonNegativeInt = 7000
+    rendered_scenes: NonNegativeInt = 14000
     validation_scenes: PositiveInt = 250
     real_share: Share = 0.4
     final_real_share: Share = 0.6

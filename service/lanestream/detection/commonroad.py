@@ -66,7 +66,8 @@ class Agreement:
 class CommonRoad:
     """How strictly boundaries keep to one road; lengths are shares of the depth.
 
-    The v and k of a boundary are those of the road give or take `vanishing` and `bend`; one that is `outlier` times
+    The v and k of a boundary are those of the road give or take `vanishing` and `bend`, and of a road that bends give
+    or take `turn` of its K, too: the inner boundary turns more sharply than the outer one. One that is `outlier` times
     that away counts half, because it is of another road, or no boundary. Of the road it is known beforehand that its
     V and K are those of the median boundary, and its horizon where it was expected, give or take `usual`; the horizon
     is not taken to be more than `nod` away.
@@ -74,6 +75,7 @@ class CommonRoad:
 
     vanishing: float = 0.003
     bend: float = 0.0006
+    turn: float = 0.1
     outlier: float = 3.0
     usual: tuple[float, float, float] = (0.1, 0.03, 0.03)
     nod: float = 0.04
@@ -97,7 +99,9 @@ class CommonRoad:
         shared = np.zeros((len(v), 2, 3))
         shared[:, 0, 0], shared[:, 0, 1] = 1.0, -drift_v
         shared[:, 1, 1], shared[:, 1, 2] = -drift_k / boundaries.depth, 1.0
-        sigma = boundaries.depth * boundaries.leaning[:, None] * np.array([self.vanishing, self.bend])
+        turn = self.turn * abs(last.road[2]) / boundaries.depth
+        usual = np.array([self.vanishing + turn, self.bend + turn])
+        sigma = boundaries.depth * boundaries.leaning[:, None] * usual
         away = (told + last.shifts @ ties.T - shared @ last.road) / sigma
         weight = sigma**-2.0 / (1.0 + (away**2).sum(axis=1, keepdims=True) / self.outlier**2)
         # Least squares over all shifts and the road. The shifts, each tied to the road alone, are eliminated.
