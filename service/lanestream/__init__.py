@@ -1,3 +1,3 @@
 """Lanestream: camera frames in, tracked lane lines out."""
 
-__version__ = "0.5.1"
+__version__ = "0.6.0"

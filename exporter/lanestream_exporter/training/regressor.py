@@ -38,8 +38,8 @@ class FrameData(PatchData):
 class RegressorConfig(TrainConfig):
     """The regressor's run."""
 
-    steps: PositiveInt = 6000
-    check_every: PositiveInt = 600
+    steps: PositiveInt = 9000
+    check_every: PositiveInt = 900
     batch: int = Field(default=64, ge=2)
     ema: float = Field(default=0.998, ge=0.0, lt=1.0)
     clip: float = Field(default=5.0, ge=0.0)
