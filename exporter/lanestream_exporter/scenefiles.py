@@ -12,6 +12,9 @@ import cv2
 
 SCENES_PER_FILE = 250
 
+# Of what is rendered and how it is labelled; part of the files' names, so that those of another edition are not used.
+EDITION = 2
+
 # Writes the file with that number, of so many scenes, to that path.
 Write = Callable[[int, int, Path], object]
 
@@ -25,13 +28,13 @@ def files_of(scenes: int) -> list[int]:
 def scene_files(
     folder: Path, kind: str, scenes: Sequence[int], write: Write, workers: int, done: Callable[[int], None]
 ) -> list[Path]:
-    """Files named by their `kind`, the n-th of `scenes[n]` scenes and made by `write`; those already there are kept.
+    """Files named by their `kind` and edition, the n-th of `scenes[n]` scenes, made by `write` where they are missing.
 
     `write` is a module's function, because other processes call it. `done` is called with the number of scenes of each
     file as it is finished.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{kind}-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
+    paths = [folder / f"{kind}-{EDITION}-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
     missing = [number for number, path in enumerate(paths) if not path.exists()]
     done(sum(scenes) - sum(scenes[number] for number in missing))
     # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.

@@ -86,10 +86,14 @@ def test_patches_are_cut_once_and_anew_where_frames_change(tmp_path: Path) -> No
 
 def test_rendered_scenes_are_shared_out_and_the_first_file_validates(tmp_path: Path) -> None:
     data = PatchData(rendered_scenes=3, validation_scenes=2, real_share=0.0, final_real_share=0.0)
+    (tmp_path / "rendered-64-1-0000-2.npz").write_bytes(b"scenes as an older version rendered them")
     told: list[tuple[int, int]] = []
     (files,) = patch_files(data, PatchStores(tmp_path, 64), None, lambda more, total: told.append((more, total)))
     assert sum(more for more, _ in told) == told[-1][1] == 5
-    assert [path.name for path in (*files.check, *files.train)] == ["rendered-64-0000-2.npz", "rendered-64-0001-3.npz"]
+    assert [path.name for path in (*files.check, *files.train)] == [
+        "rendered-64-2-0000-2.npz",
+        "rendered-64-2-0001-3.npz",
+    ]
     source = files.read()
     assert source.counts["train"] == len(source.train) > len(source.check) > 0
     assert origin_of(data) == {"real_frames": "none", "rendered_scenes": 3}
