@@ -56,7 +56,7 @@ def read_stores(paths: Sequence[Path]) -> PatchStore:
             with np.load(path, allow_pickle=False) as file:
                 parts.append(PatchStore(file["data"], file["offsets"], file["labels"]))
         except (OSError, ValueError, KeyError) as error:
-            raise LabelError(f"{path} is not a file of patches: {error}", "delete it to have it made again") from error
+            raise LabelError(f"{path} is not a file of patches", "delete it to have it made again") from error
     starts = np.cumsum([0, *(len(part.data) for part in parts)])
     offsets = [part.offsets[:-1] + start for part, start in zip(parts, starts, strict=False)]
     return PatchStore(

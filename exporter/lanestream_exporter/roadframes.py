@@ -106,7 +106,7 @@ def read_frames(path: Path) -> list[RoadFrame]:
         with np.load(path, allow_pickle=False) as file:
             data, sizes, notes = file["data"], file["sizes"], json.loads(file["notes"].tobytes())
     except (OSError, ValueError, KeyError) as error:
-        raise LabelError(f"{path} is not a file of frames: {error}", "delete it to have it made again") from error
+        raise LabelError(f"{path} is not a file of frames", "delete it to have it made again") from error
     ends = np.cumsum(sizes)
     return [
         RoadFrame(
