@@ -125,6 +125,21 @@ async def test_a_worker_that_ends_loses_its_frame_alone_and_is_replaced() -> Non
         assert not psutil.pid_exists(first)
 
 
+async def test_a_worker_that_hangs_is_ended_and_replaced(caplog: pytest.LogCaptureFixture) -> None:
+    async with started(fakes.engine, patience_s=1.0) as runner:
+        camera = runner.open_camera()
+        (first,) = runner.pids
+        os.kill(first, signal.SIGSTOP)
+        with pytest.raises(WorkerLostError):
+            await runner.run(camera, frame())
+        assert not psutil.pid_exists(first)
+        assert "a worker process has been at a frame for 1 s; it is ended" in caplog.text
+        while not runner.works:
+            await asyncio.sleep(0.05)
+        os.kill(*runner.pids, 0)  # another one, and it lives
+        assert runner.pids != (first,)
+
+
 async def test_a_deadline_holds_in_the_worker_too() -> None:
     async with started(fakes.engine) as runner:
         late = EncodedFrame(fakes.image_file(), 0.0, time.monotonic(), deadline=time.monotonic() - 1.0)

@@ -38,6 +38,8 @@ _SERVICE_BYTES: Final = 300e6
 _RESTART_S: Final = 0.5
 _LONGEST_RESTART_S: Final = 30.0
 _END_S: Final = 10.0
+# A frame takes a worker a fraction of a second, many seconds on a busy machine: one that has had it for longer hangs.
+_PATIENCE_S: Final = 30.0
 
 
 class RemoteCamera:
@@ -169,17 +171,24 @@ class Worker:
 class ProcessRunner(FrameRunner):
     """Hands each frame, with what is known of its camera, to the worker process that has the fewest.
 
-    Workers that end are replaced; `observe` is told of every batch that their networks run.
+    Workers that end are replaced, and one that has been at a frame for `patience_s` seconds is ended; `observe` is told
+    of every batch that their networks run.
     """
 
     def __init__(
-        self, setup: Setup, workers: list[Worker], threads: int, observe: Callable[[BatchReport], None] | None = None
+        self,
+        setup: Setup,
+        workers: list[Worker],
+        threads: int,
+        observe: Callable[[BatchReport], None] | None = None,
+        patience_s: float = _PATIENCE_S,
     ) -> None:
         super().__init__(workers[0].offers, Places.of(len(workers), threads), processors())
         self._setup = setup
         self._workers = workers
         self._threads = threads
         self._observe = observe
+        self._patience_s = patience_s
         for worker in workers:
             worker.begin(threads)
         self._keepers = [asyncio.create_task(self._keep(worker)) for worker in workers]
@@ -191,6 +200,7 @@ class ProcessRunner(FrameRunner):
         processes: int | None = None,
         threads_of: Callable[[int], int] | None = None,
         observe: Callable[[BatchReport], None] | None = None,
+        patience_s: float = _PATIENCE_S,
     ) -> ProcessRunner:
         """A runner with warm workers: `threads_of` tells the threads of each of so many `processes`, 1 without it.
 
@@ -208,7 +218,7 @@ class ProcessRunner(FrameRunner):
             for worker in workers:
                 await worker.kill()
             raise error.exceptions[0] if isinstance(error, ExceptionGroup) else error from None
-        return cls(setup, workers, threads_of(processes) if threads_of is not None else 1, observe)
+        return cls(setup, workers, threads_of(processes) if threads_of is not None else 1, observe, patience_s)
 
     @property
     def works(self) -> bool:
@@ -242,7 +252,13 @@ class ProcessRunner(FrameRunner):
         if not self._living:
             raise _lost()
         worker = min(self._living, key=lambda each: each.in_work)
-        done = await worker.ask(camera, frame, crowded=crowded)
+        try:
+            async with asyncio.timeout(self._patience_s):
+                done = await worker.ask(camera, frame, crowded=crowded)
+        except TimeoutError:
+            _log.error("a worker process has been at a frame for %g s; it is ended", self._patience_s)
+            await worker.kill()
+            raise _lost() from None
         if self._observe is not None:
             for report in done.batches:
                 self._observe(report)
