@@ -13,7 +13,7 @@ import cv2
 SCENES_PER_FILE = 250
 
 # Of what is rendered and how it is labelled; part of the files' names, so that those of another edition are not used.
-EDITION = 2
+EDITION = 3
 
 # Writes the file with that number, of so many scenes, to that path.
 Write = Callable[[int, int, Path], object]

@@ -91,8 +91,8 @@ def test_rendered_scenes_are_shared_out_and_the_first_file_validates(tmp_path: P
     (files,) = patch_files(data, PatchStores(tmp_path, 64), None, lambda more, total: told.append((more, total)))
     assert sum(more for more, _ in told) == told[-1][1] == 5
     assert [path.name for path in (*files.check, *files.train)] == [
-        "rendered-64-2-0000-2.npz",
-        "rendered-64-2-0001-3.npz",
+        "rendered-64-3-0000-2.npz",
+        "rendered-64-3-0001-3.npz",
     ]
     source = files.read()
     assert source.counts["train"] == len(source.train) > len(source.check) > 0

@@ -78,7 +78,9 @@ def sample_walls(dice: Dice, layout: Layout) -> tuple[Wall, ...]:
 
 def _wall(dice: Dice, kind: WallKind, u: float, outwards: float) -> Wall:
     low, high, away = WALL_HEIGHTS[kind]
-    colour = dice.pick(LEAVES) if kind == "hedge" else grey(dice, dice.between(0.4, 0.75))
+    # The face of a wall away from the sun is darker than the road.
+    shade = dice.between(0.2, 0.7) if dice.chance(0.45) else 1.0
+    colour = dice.pick(LEAVES) if kind == "hedge" else grey(dice, shade * dice.between(0.4, 0.75))
     return Wall(kind, u + outwards * away, dice.between(low, high), colour)
 
 
