@@ -38,8 +38,8 @@ class FrameData(PatchData):
 class RegressorConfig(TrainConfig):
     """The regressor's run."""
 
-    steps: PositiveInt = 9000
-    check_every: PositiveInt = 900
+    steps: PositiveInt = 10000
+    check_every: PositiveInt = 1000
     batch: int = Field(default=64, ge=2)
     ema: float = Field(default=0.998, ge=0.0, lt=1.0)
     clip: float = Field(default=5.0, ge=0.0)
