@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,24 @@ def curves_through(horizon: float, rows: FloatArray, columns: FloatArray) -> lis
     """The curve through each row of `columns` (N, 3), which they have at the same three `rows` (3,) below `horizon`."""
     coefficients = np.linalg.solve(curve_basis(horizon, rows), columns.T).T.tolist()
     return [Curve(horizon, (v, b, k)) for v, b, k in coefficients]
+
+
+# The shares of a depth at which a curve is told anew: three tell it.
+_TELLING: Final = np.array([1.0, 0.45, 0.15])
+
+
+def under_horizon(curves: Sequence[Curve], horizon: float, bottom: float) -> list[Curve]:
+    """The curves told from another `horizon`, from which on they are curves at all, down to the row `bottom`.
+
+    Each has the columns that it had at three rows below its own horizon and below the new one: a curve of a lower
+    horizon goes on as it bends, where it had no columns.
+    """
+    told = []
+    for curve in curves:
+        highest = max(curve.horizon, horizon)
+        rows = highest + _TELLING * (bottom - highest)
+        told += curves_through(horizon, rows, curve_columns([curve], rows))
+    return told
 
 
 def curve_columns(curves: Sequence[Curve], rows: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.geometry import RoadView, Scaling
-from lanestream.lanes import Curve, FloatArray, curve_columns
+from lanestream.lanes import Curve, FloatArray, curve_columns, under_horizon
 
 # The two rows, as shares of the depth, at which lines are told, compared and suppressed.
 NEAR: Final = 1.0
@@ -41,9 +41,10 @@ class Lines:
 
     @classmethod
     def along(cls, curves: Sequence[Curve], scaling: Scaling, view: RoadView) -> Lines:
-        """Curves of the image as lines of the working image, all of strength 1."""
-        near, far = curve_columns([scaling.curve_to_working(curve) for curve in curves], told_rows(view)).T
-        return cls(near, far, np.ones(len(curves)), tuple(curves))
+        """Curves of the image as lines of the working image, all of strength 1, told from the view's horizon."""
+        working = under_horizon([scaling.curve_to_working(curve) for curve in curves], view.horizon, view.bottom)
+        near, far = curve_columns(working, told_rows(view)).T
+        return cls(near, far, np.ones(len(curves)), tuple(scaling.curve_to_image(curve) for curve in working))
 
     @classmethod
     def joined(cls, parts: Sequence[Lines]) -> Lines:

@@ -27,8 +27,10 @@ _COMPARED: Final = np.array(ANCHORS[:2])
 # No line is told more exactly than this, in rows below the horizon.
 _EXACT: Final = 0.02
 
-# How many times likelier a boundary is a whole lane beside the ego lane than just anywhere outside it.
+# How many times likelier a line is a boundary where it is a whole lane beside the ego lane, and how many of that where it
+# is as far as can be from such places: the feet of walls and the edges of the pavement run there, and hardly a boundary.
 _REPEATED: Final = 1.5
+_OFF_LATTICE: Final = 0.05
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ class RoadPrior:
         odds = np.ones(len(curves))
         if len(away) == 2:
             within = np.minimum(away[0].mean(axis=1), -away[1].mean(axis=1))
-            lattice = Lattice(*(float((boundary.curve.x(rows) / below).mean()) for boundary in self.seen))
+            sides = (float((boundary.curve.x(rows) / below).mean()) for boundary in self.seen)
+            lattice = Lattice(*sides, least=_OFF_LATTICE)
             odds = _REPEATED * lattice.trust(places.mean(axis=1)) / (1.0 + np.exp(within.clip(-30.0, 30.0)))
         for boundary, off in zip(self.seen, away, strict=True):
             density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (off**2).mean(axis=1) / 3.0) ** 2 / boundary.spread.mean()
