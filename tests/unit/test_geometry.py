@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanestream.geometry import RoadView, Scaling, StripGeometry, visible_rows
-from lanestream.lanes import Candidate, Curve, curve_basis
+from lanestream.lanes import Candidate, Curve, curve_basis, under_horizon
 
 VIEW = RoadView(640, 360, 160.0)
 
@@ -18,6 +18,19 @@ def test_curve_goes_through_its_three_points() -> None:
     curve = Curve.through(160.0, rows, columns)
     np.testing.assert_allclose(curve.x(rows), columns, atol=1e-9)
     np.testing.assert_allclose(curve_basis(160.0, rows) @ curve.coefficients, columns, atol=1e-9)
+
+
+def test_a_curve_told_from_another_horizon_keeps_its_columns() -> None:
+    curve = Curve(200.0, (320.0, -1.2, 3000.0))
+    (same,) = under_horizon([curve], 200.0, 479.0)
+    np.testing.assert_allclose(same.coefficients, curve.coefficients)
+    (higher,) = under_horizon([curve], 150.0, 479.0)
+    rows = 200.0 + np.array([1.0, 0.45, 0.15]) * 279.0
+    assert higher.horizon == 150.0
+    np.testing.assert_allclose(higher.x(rows), curve.x(rows), atol=1e-6)
+    # Above its own horizon the first one has no columns; told from a higher one it goes on.
+    assert float(higher.x(195.0)) < 640.0 < float(curve.x(195.0))
+    assert not under_horizon([], 150.0, 479.0)
 
 
 def test_slope_is_the_derivative() -> None:

@@ -34,7 +34,11 @@ def test_boundaries_are_likelier_where_they_were_seen_and_hardly_possible_within
 
 def test_lanes_repeat_outside_the_ego_lane() -> None:
     next_lane, between = RoadPrior(VIEW, seen(-1.2), seen(1.2)).odds([line(3.6), line(2.4)])
-    assert next_lane > 1.0 > between
+    assert next_lane > 1.0
+    # Half a lane beside the ego lane stand walls and kerbs: a line there needs a surer word.
+    assert between == pytest.approx(0.075, rel=0.05)
+    assert len(found(RoadPrior(VIEW, seen(-1.2), seen(1.2)), {-1.2: 0.9, 1.2: 0.9, 2.4: 0.9, 3.6: 0.9})) == 3
+    assert len(found(RoadPrior(VIEW, seen(-1.2), seen(1.2)), {-1.2: 0.9, 1.2: 0.9, 2.4: 0.97})) == 3
 
 
 def test_a_glance_that_doubts_says_less() -> None:

@@ -27,8 +27,8 @@ _COMPARED: Final = np.array(ANCHORS[:2])
 # No line is told more exactly than this, in rows below the horizon.
 _EXACT: Final = 0.02
 
-# How many times likelier a line is a boundary where it is a whole lane beside the ego lane, and how many of that where it
-# is as far as can be from such places: the feet of walls and the edges of the pavement run there, and hardly a boundary.
+# How many times likelier a line is a boundary where it is a whole lane beside the ego lane, and the share of that where
+# it is far from such places: the feet of walls and the edges of the pavement run there, and hardly a boundary.
 _REPEATED: Final = 1.5
 _OFF_LATTICE: Final = 0.05
 
