@@ -6,7 +6,7 @@ false where it is far from every label, and left out of training in between, whe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +101,8 @@ class PatchMaker:
     def proposed(self, image: Image, frame: LabelledFrame) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
         """Patches (N, size, size, 3) of the frame's own candidates, and what each is (N,)."""
         proposals = self.search.propose(image)
-        return self._judged(image, proposals.candidates, frame, proposals.view)
+        verdicts = self.rule.judge(proposals.candidates, frame, proposals.view)
+        return self.cutter.cut(image, proposals.candidates, proposals.view), verdicts
 
     def jittered(
         self, image: Image, frame: LabelledFrame, view: RoadView, rng: np.random.Generator
@@ -112,19 +113,17 @@ class PatchMaker:
             fitted = fitted_candidate(lane, view)
             if fitted is not None:
                 candidates += [_moved(fitted, view, shift) for shift in _shifts(rng)]
-        return self._judged(image, candidates, frame, view)
+        verdicts = self.rule.judge(candidates, frame, view)
+        return self.cutter.cut(image, candidates, view), verdicts
 
-    def along(
-        self, lines: Sequence[LabelledLane], image: Image, frame: LabelledFrame, view: RoadView
-    ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Patches along `lines` that are no labels, such as those of walls; one may run beside a label all the same."""
-        fitted = [fitted_candidate(line, view) for line in lines]
-        return self._judged(image, [candidate for candidate in fitted if candidate is not None], frame, view)
-
-    def _judged(
-        self, image: Image, candidates: Sequence[Candidate], frame: LabelledFrame, view: RoadView
-    ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        return self.cutter.cut(image, candidates, view), self.rule.judge(candidates, frame, view)
+    def all_of(
+        self, image: Image, frame: LabelledFrame, view: RoadView, rng: np.random.Generator
+    ) -> Iterator[tuple[NDArray[np.uint8], int]]:
+        """Trainable patches of a frame one by one: proposed and jittered ones that are clearly true or false."""
+        for patches, verdicts in (self.proposed(image, frame), self.jittered(image, frame, view, rng)):
+            for patch, verdict in zip(patches, verdicts, strict=True):
+                if verdict in (FALSE, TRUE):
+                    yield patch, int(verdict)
 
 
 @dataclass(frozen=True)

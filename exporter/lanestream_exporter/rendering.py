@@ -15,7 +15,7 @@ from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, StripGeometry
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.patches import FALSE, TRUE, PatchMaker
+from lanestream_exporter.patches import PatchMaker
 from lanestream_exporter.patchstore import write_store
 from lanestream_exporter.scenefiles import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
@@ -67,25 +67,17 @@ def _rendered_patches(size: int, number: int, scenes: int) -> Iterator[tuple[NDA
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
         still = render_still(sample_scene(rng, width, height))
         view = RoadView(width, height, still.horizon)
-        yield from _clear(maker.proposed(still.image, still.labels))
-        yield from _clear(maker.jittered(still.image, still.labels, view, rng))
-        yield from _clear(maker.along(still.walls, still.image, still.labels, view))
+        yield from maker.all_of(still.image, still.labels, view, rng)
 
 
 def _labelled_patches(size: int, frames: Frames, to_train: bool) -> Iterator[tuple[NDArray[np.uint8], int]]:
     # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
     search = CandidateSearch(limit=32) if to_train else CandidateSearch()
     maker = PatchMaker(search, StripCutter(StripGeometry(size)))
+    clear = partial(filter, lambda item: item[1] in (0, 1))
     for number, (frame, image) in enumerate(frames):
         rng = np.random.default_rng([number, 1])
         proposals = maker.search.propose(image)
-        yield from _clear(maker.proposed(image, frame))
+        yield from clear(zip(*maker.proposed(image, frame), strict=True))
         for _ in range(_ROUNDS if to_train else 0):
-            yield from _clear(maker.jittered(image, frame, proposals.view, rng))
-
-
-def _clear(judged: tuple[NDArray[np.uint8], NDArray[np.int64]]) -> Iterator[tuple[NDArray[np.uint8], int]]:
-    """Of patches and verdicts those that are clearly true or false, one by one."""
-    for patch, verdict in zip(*judged, strict=True):
-        if verdict in (FALSE, TRUE):
-            yield patch, int(verdict)
+            yield from clear(zip(*maker.jittered(image, frame, proposals.view, rng), strict=True))

@@ -13,7 +13,7 @@ from lanestream.lanes import Candidate, Curve
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
-from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, UNSURE, PatchMaker, TruthRule, fitted_candidate
+from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, UNSURE, TruthRule, fitted_candidate
 from lanestream_exporter.patchstore import read_stores, write_store
 
 VIEW = RoadView(1280, 720, 300.0)
@@ -68,14 +68,6 @@ def test_a_label_becomes_the_candidate_that_follows_it() -> None:
     fitted = fitted_candidate(LabelledLane(np.stack([bent.x(rows), rows], axis=1)), VIEW)
     assert fitted is not None
     np.testing.assert_allclose(fitted.curve.x(rows), bent.x(rows), atol=0.01)
-
-
-def test_patches_along_walls_are_false_where_no_label_is_near() -> None:
-    image = np.full((720, 1280, 3), 90, np.uint8)
-    walls = [label(-2.5), label(-1.11), LabelledLane(np.empty((0, 2)))]
-    patches, verdicts = PatchMaker().along(walls, image, frame(label(-1.1), exhaustive=True), VIEW)
-    assert verdicts.tolist() == [FALSE, TRUE]
-    assert len(patches) == 2
 
 
 def found(b: float, v: float = 640.0, top: float = 342.0, position: int = -1) -> Found:

@@ -138,19 +138,6 @@ def test_labels_end_where_a_wall_hides_the_road(plain: Scene) -> None:
     assert hidden.lanes[0].points[:, 1].min() > open_view.lanes[0].points[:, 1].min() + 2.0
 
 
-def test_lines_of_walls_lie_on_their_foot_and_their_top(plain: Scene) -> None:
-    wall = Wall("jersey", u=4.0, height=1.0, color=(0.9, 0.9, 0.9))
-    frame = render_still(replace(plain, walls=(wall,)))
-    foot, top = frame.walls
-    columns = RoadView.ahead(plain.camera, plain.road.course, plain.pose).boundary(foot.points[:, 1], 4.0)
-    np.testing.assert_allclose(foot.points[:, 0], columns, atol=0.5)
-    for x, y in np.round(foot.points[:12]).astype(int):
-        assert int(frame.image[y - 3, x, 1]) - int(frame.image[y + 3, x, 1]) > 40  # wall above, road below
-    for x, y in np.round(top.points[:12]).astype(int):
-        assert np.abs(frame.image[y - 3, x].astype(int) - frame.image[y + 3, x]).max() > 20
-    assert not render_still(plain).walls
-
-
 @pytest.mark.parametrize("seed", range(12))
 def test_sampled_labels_are_inside_ordered_and_exhaustive(seed: int) -> None:
     frame = render_still(sample_scene(np.random.default_rng(seed), 320, 180))

@@ -20,7 +20,6 @@ NARROWEST = 12.0  # pixels of a picture 640 wide: where a lane is narrower, its 
 USUAL_LANE = 3.5  # metres
 ROWS = 90  # a label has a point on every row of the picture divided by this
 SHORTEST = 0.05  # share of the picture's height that a label must span
-NEAREST = 2.0  # metres ahead of the lens where a wall's lines begin
 
 
 def annotate(scene: Scene, view: RoadView, hidden: Image) -> LabelledFrame:
@@ -36,20 +35,6 @@ def annotate(scene: Scene, view: RoadView, hidden: Image) -> LabelledFrame:
         colour = boundary.marking.color if boundary.marking else None
         lanes.append(LabelledLane(points, lane_id, position, boundary.kind, colour))
     return LabelledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, exhaustive=True)
-
-
-def wall_lines(scene: Scene, view: RoadView) -> tuple[LabelledLane, ...]:
-    """The lowest and the highest line of each wall in the picture: they run along the road, and bound no lane."""
-    near = (view.x > NEAREST) & (view.x < min(FARTHEST, view.reach, sight(scene)))
-    s = view.s[near]
-    lines = []
-    for wall in scene.walls:
-        for share in wall.extent:
-            points = view.project(s, np.full(len(s), wall.u), np.full(len(s), share * wall.height))
-            inside = (points >= 0.0).all(axis=1) & (points[:, 0] < scene.camera.width)
-            inside &= points[:, 1] < scene.camera.height
-            lines.append(LabelledLane(points[inside]))
-    return tuple(lines)
 
 
 def _rows(scene: Scene, view: RoadView) -> FloatArray:

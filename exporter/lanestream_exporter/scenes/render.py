@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from lanestream_exporter.scenes.annotation import annotate, wall_lines
+from lanestream_exporter.scenes.annotation import annotate
 from lanestream_exporter.scenes.backdrop import draw_backdrop
 from lanestream_exporter.scenes.canvas import Canvas, Image
 from lanestream_exporter.scenes.lens import develop
@@ -22,7 +22,7 @@ from lanestream_exporter.scenes.traffic import Vehicle, draw_vehicle
 from lanestream_exporter.scenes.view import Grid, RoadView
 
 if TYPE_CHECKING:
-    from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+    from lanestream_exporter.datasets.labels import LabelledFrame
     from lanestream_exporter.scenes.scene import Scene
 
 
@@ -36,7 +36,6 @@ class RenderedFrame:
     image: Image  # (H, W, 3) uint8, blue, green, red
     labels: LabelledFrame
     horizon: float  # image row of the road's vanishing plane, pixels
-    walls: tuple[LabelledLane, ...] = ()  # lines along the road that bound no lane
     timestamp: float = 0.0  # seconds since the clip began
 
 
@@ -53,7 +52,7 @@ def render_still(scene: Scene) -> RenderedFrame:
     if scene.wetness > 0.0:
         _mirror(canvas, grid, scene.wetness)
     labels = annotate(scene, view, canvas.hidden)
-    return RenderedFrame(develop(canvas.image, scene.lens), labels, camera.horizon, wall_lines(scene, view))
+    return RenderedFrame(develop(canvas.image, scene.lens), labels, camera.horizon)
 
 
 def _draw_ground(canvas: Canvas, scene: Scene, grid: Grid) -> None:

@@ -44,12 +44,6 @@ class Wall:
     height: float
     color: Colour
 
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Where its lowest stripe begins and its highest one ends, as shares of its height."""
-        stripes, _ = WALL_STRIPES[self.kind]
-        return min(low for low, _, _ in stripes), max(high for _, high, _ in stripes)
-
 
 @dataclass(frozen=True)
 class Item:
