@@ -81,8 +81,8 @@ class RoadPrior:
         odds = np.ones(len(curves))
         if len(away) == 2:
             within = np.minimum(away[0].mean(axis=1), -away[1].mean(axis=1))
-            sides = (float((boundary.curve.x(rows) / below).mean()) for boundary in self.seen)
-            lattice = Lattice(*sides, least=_OFF_LATTICE)
+            left, right = (float((boundary.curve.x(rows) / below).mean()) for boundary in self.seen)
+            lattice = Lattice(left, right, least=_OFF_LATTICE)
             odds = _REPEATED * lattice.trust(places.mean(axis=1)) / (1.0 + np.exp(within.clip(-30.0, 30.0)))
         for boundary, off in zip(self.seen, away, strict=True):
             density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (off**2).mean(axis=1) / 3.0) ** 2 / boundary.spread.mean()
