@@ -61,6 +61,12 @@ def test_a_known_horizon_is_kept_but_for_a_nod() -> None:
         assert CandidateSearch().propose(still.image, horizon).view.horizon == pytest.approx(horizon, abs=20.0)
 
 
+def is_told_anew(curve: Curve, known: Curve, bottom: float) -> bool:
+    """Whether a candidate's curve is a known one, told from the horizon that the search has found."""
+    rows = np.linspace(known.horizon + 0.15 * (bottom - known.horizon), bottom, 20)
+    return bool(np.abs(curve.x(rows) - known.x(rows)).max() < 0.1)
+
+
 def test_followed_boundaries_come_first_and_fewer_others_with_them() -> None:
     still = fair_scene(640, 360)
     search = CandidateSearch(faintest=0.0)
@@ -69,7 +75,7 @@ def test_followed_boundaries_come_first_and_fewer_others_with_them() -> None:
     followed = search.propose(still.image, still.horizon, expected).candidates
     assert len(found) == 16
     assert len(followed) == 12
-    assert followed[0].curve == expected[0]
+    assert is_told_anew(followed[0].curve, expected[0], 359.0)
 
 
 def test_the_line_beside_a_boundary_of_the_prior_is_a_candidate_too_unless_boundaries_are_followed() -> None:
@@ -84,7 +90,7 @@ def test_the_line_beside_a_boundary_of_the_prior_is_a_candidate_too_unless_bound
     def beside(twin: float, expected: list[Curve]) -> int:
         search = CandidateSearch(twin=twin)
         found = search.propose(still.image, still.horizon, expected, prior).candidates
-        assert found[0].curve == (expected or [aside])[0]
+        assert is_told_anew(found[0].curve, (expected or [aside])[0], view.bottom)
         near = [abs(float(candidate.curve.x(view.bottom) - left.x(view.bottom))) for candidate in found]
         return sum(off < 0.03 * view.depth for off in near)
 

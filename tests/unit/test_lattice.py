@@ -70,4 +70,5 @@ def test_boundaries_of_the_last_frame_come_before_the_prior() -> None:
     image, prior = faint_road(0.0)
     expected = Curve(150.0, (320.0, -0.6, 0.0))
     proposals = CandidateSearch().propose(image, 150.0, [expected], prior)
-    assert proposals.candidates[0].curve == expected
+    rows = np.linspace(180.0, 359.0, 20)  # told from the horizon that the search has found
+    np.testing.assert_allclose(proposals.candidates[0].curve.x(rows), expected.x(rows), atol=0.1)
