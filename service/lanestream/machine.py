@@ -8,11 +8,10 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from lanestream.inference.providers import cuda_version, preload_gpu_libraries
-from lanestream.processors import affinity, processors, quota
+from lanestream.processors import affinity, cpu_entries, instructions, processors, quota
 
 # Instructions that decide how fast a network is, on x86 and on ARM.
 _FLAGS: Final = (
@@ -52,9 +51,8 @@ class Gpu:
 
 def cpu() -> Cpu:
     """The CPU of this machine."""
-    told = _cpuinfo(Path("/proc/cpuinfo"))
-    name = told.get("model name") or platform.processor() or platform.machine()
-    has = (told.get("flags") or told.get("features", "")).split()
+    name = cpu_entries().get("model name") or platform.processor() or platform.machine()
+    has = instructions()
     return Cpu(name, tuple(flag for flag in _FLAGS if flag in has), affinity(), quota(), processors())
 
 
@@ -83,16 +81,6 @@ def version_of(
         except (OSError, AttributeError):
             continue
     return None
-
-
-def _cpuinfo(path: Path) -> dict[str, str]:
-    """The first processor's entries, their names in small letters."""
-    try:
-        lines = path.read_text().split("\n\n")[0].splitlines()
-    except OSError:
-        return {}
-    pairs = (line.partition(":") for line in lines)
-    return {key.strip().lower(): value.strip() for key, _, value in pairs}
 
 
 def _devices() -> tuple[tuple[str, ...], str | None]:

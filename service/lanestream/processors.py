@@ -1,4 +1,4 @@
-"""How many processors this process may use: its affinity, and the quota of its control groups."""
+"""The processors: how many this process may use, by its affinity and its control groups, and what they can do."""
 
 from __future__ import annotations
 
@@ -47,6 +47,22 @@ def _limit_1(group: Path) -> float | None:
 def _share(allowed: int, period: int) -> float | None:
     """Microseconds in every period of as many, as processors; none is no limit."""
     return allowed / period if allowed > 0 and period > 0 else None
+
+
+def cpu_entries(path: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
+    """What the system tells of its first processor, the entries' names in small letters; nothing outside Linux."""
+    try:
+        lines = path.read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return {}
+    pairs = (line.partition(":") for line in lines)
+    return {key.strip().lower(): value.strip() for key, _, value in pairs}
+
+
+def instructions() -> frozenset[str]:
+    """The first processor's instruction sets by Linux's names, x86's and ARM's; nothing outside Linux."""
+    told = cpu_entries()
+    return frozenset((told.get("flags") or told.get("features", "")).split())
 
 
 def network_threads() -> int:

@@ -84,7 +84,7 @@ def test_the_classifiers_file_answers_as_pytorch_does_at_any_batch_size(classifi
     assert expected[:, 1].std() > 0.02
     whole = model.run(inputs)
     np.testing.assert_allclose(whole.sum(axis=1), 1.0, atol=1e-5)
-    assert np.abs(whole - expected).mean() < 0.2 * expected[:, 1].std()
+    assert np.abs(whole - expected).mean() < 0.3 * expected[:, 1].std()
     np.testing.assert_allclose(np.concatenate([model.run(p[None]) for p in inputs[:5]]), whole[:5], atol=1e-4)
     assert model.run(inputs[:0]).shape == (0, 2)
 
@@ -97,6 +97,14 @@ def test_int8_is_measured_against_fp32_and_much_smaller(classifier: Exported) ->
     assert set(report.lost) == {"checkpoint", "fp32"}
     assert report.time_ratio is not None
     assert report.inputs == len(classifier.check.inputs)
+
+
+def test_int8_weights_take_seven_bits(classifier: Exported) -> None:
+    """Processors that add two products in sixteen bits would cut off sums of larger ones."""
+    parameters = onnx.load(str(classifier.path)).graph.initializer
+    weights = [onnx.numpy_helper.to_array(part) for part in parameters if part.name.endswith("weight_quantized")]
+    assert len(weights) > 7
+    assert {int(np.abs(part.astype(int)).max()) for part in weights} == {64}
 
 
 def test_the_regressors_file_says_what_its_answer_is(regressor: Exported) -> None:

@@ -1,8 +1,10 @@
 """Which provider is taken, what is said of it, and that networks answer alike whichever runs them."""
 
 import hashlib
+import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +21,9 @@ from lanestream.inference.providers import Offer, attempts, offered
 from lanestream.runtime import Provider, RuntimeOptions
 from lanestream_exporter.scenes import render_still, sample_scene
 
-CPU_ALONE = Offer(frozenset({"CPUExecutionProvider"}), openvino=False)
-WITH_CUDA = Offer(frozenset({"CUDAExecutionProvider", "CPUExecutionProvider"}), openvino=False)
+CPU_ALONE = Offer(frozenset({"CPUExecutionProvider"}), openvino=False, amx=True)
+WITH_CUDA = Offer(frozenset({"CUDAExecutionProvider", "CPUExecutionProvider"}), openvino=False, amx=True)
+WITH_OPENVINO = Offer(frozenset({"CPUExecutionProvider"}), openvino=True, amx=True)
 FP32_MODEL = SHIPPED_MODEL.with_name("classifier-fp32.onnx")
 
 
@@ -97,13 +100,21 @@ def test_auto_takes_the_cpu_where_there_is_nothing_else_and_says_why() -> None:
 
 
 def test_auto_never_takes_tensorrt() -> None:
-    assert list(attempts("auto")) == ["cuda", "openvino", "cpu"]
+    for offer in (WITH_CUDA, WITH_OPENVINO, replace(WITH_OPENVINO, amx=False)):
+        assert "tensorrt" not in attempts("auto", offer)
 
 
-def test_auto_takes_openvino_where_it_is_installed() -> None:
-    network = load_network(SHIPPED_MODEL)
-    assert network.provider == "openvino"
-    assert network.reason.endswith("OpenVINO is installed")
+@pytest.mark.parametrize(("amx", "provider"), [(True, "openvino"), (False, "cpu")])
+def test_auto_takes_openvino_where_the_cpu_has_amx(amx: bool, provider: Provider) -> None:
+    network = load_network(SHIPPED_MODEL, "auto", offer=replace(WITH_OPENVINO, amx=amx))
+    assert network.provider == provider
+    assert "AMX" in network.reason
+    assert not network.fell_back, "OpenVINO could be had"
+
+
+def test_what_this_machine_offers_is_looked_up() -> None:
+    assert offered().openvino
+    assert offered().amx == ("amx_int8" in Path("/proc/cpuinfo").read_text())
 
 
 # This build of onnxruntime has no CUDA: asked for it, it falls back in silence, as it does where a library is missing.
@@ -195,6 +206,30 @@ def test_openvino_computes_what_onnxruntime_computes(rendered: tuple[NDArray[np.
     # A thirtieth of what an int8 export may differ from PyTorch.
     assert apart.mean() <= 1e-3
     assert apart.max() <= 0.02
+
+
+OLDER = """
+import sys
+import numpy as np
+from pathlib import Path
+from lanestream.inference import OpenVinoModel
+inputs = np.load(sys.argv[2])
+np.save(sys.argv[3], OpenVinoModel.load(Path(sys.argv[1])).run(inputs))
+"""
+
+
+@pytest.mark.parametrize("path", [SHIPPED_MODEL, SHIPPED_REGRESSOR], ids=lambda path: path.stem)
+def test_int8_answers_are_the_same_on_a_processor_without_vnni(
+    path: Path, rendered: tuple[NDArray[np.uint8], NDArray[np.uint8]], tmp_path: Path
+) -> None:
+    """Such a one adds products in sixteen bits; weights of eight would make it cut off sums, and answer otherwise."""
+    inputs = rendered[0 if path == SHIPPED_MODEL else 1]
+    given, taken = tmp_path / "inputs.npy", tmp_path / "outputs.npy"
+    np.save(given, inputs)
+    command = [sys.executable, "-c", OLDER, str(path), str(given), str(taken)]
+    subprocess.run(command, check=True, timeout=120, env={**os.environ, "ONEDNN_MAX_CPU_ISA": "AVX2"})
+    # Ties are rounded differently.
+    assert np.abs(np.load(taken) - OpenVinoModel.load(path).run(inputs)).mean() < 1e-4
 
 
 def test_openvino_refuses_files_as_onnxruntime_does(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ def load_network(
     offer = offer or offered()
     passed_over: list[str] = []
     fell_back = False
-    for name, why in attempts(provider).items():
+    for name, why in attempts(provider, offer).items():
         installed = False
         try:
             require(name, offer)
