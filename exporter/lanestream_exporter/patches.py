@@ -27,7 +27,7 @@ class TruthRule:
     """When a candidate is true: distances across the line, in pixels of a 1280 pixel wide image.
 
     True up to `near` on average over at least `overlap` of a label's rows, false beyond `far` from every label, unsure
-    in between. Beside the outermost label of a frame that is not exhaustively labelled it is unknown.
+    in between. Beyond the outermost label, on a side where not all is labelled, it is unknown.
     """
 
     near: float = 12.0
@@ -45,17 +45,21 @@ class TruthRule:
             return TRUE
         if any(distance * scale <= self.far and overlap > 0.0 for distance, overlap in measured):
             return UNSURE
-        return FALSE if frame.exhaustive or self._between(candidate, frame) else UNKNOWN
+        return UNKNOWN if self._beyond(candidate, frame) else FALSE
 
-    def _between(self, candidate: Candidate, frame: LabelledFrame) -> bool:
-        """Whether the candidate runs between two labels, at some row that it shares with them."""
+    def _beyond(self, candidate: Candidate, frame: LabelledFrame) -> bool:
+        """Whether half of the candidate lies beside the outermost label of a side that is open."""
         rows = np.linspace(candidate.top, candidate.bottom, 16)
         columns = candidate.curve.x(rows)
         left, right = np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
         for lane in frame.lanes:
             x = columns_at(lane, rows)
             left, right = np.fmin(left, x), np.fmax(right, x)
-        return bool(((columns > left) & (columns < right)).mean() > 0.5)
+        # Rows without any label count for both sides.
+        return any(
+            frame.open_to(side) and beside.mean() >= 0.5
+            for side, beside in ((-1, columns <= left), (1, columns >= right))
+        )
 
 
 def columns_at(lane: LabelledLane, rows: FloatArray) -> FloatArray:

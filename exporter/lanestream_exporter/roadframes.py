@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -30,7 +30,7 @@ class RoadFrame:
     """A frame as the regressor learns from it: its picture as JPEG bytes, and in pixels of that picture its boundaries.
 
     `lanes` are polylines (N, 2) from the lowest row upwards; `horizon` is the row at which they meet. `exhaustive` says
-    that what is not labelled is not there. `group` names the drive or clip.
+    that an ego boundary without label is not there. `group` names the drive or clip.
     """
 
     jpeg: bytes
@@ -61,7 +61,7 @@ class RoadFrame:
         if horizon is None:
             return None
         jpeg = cv2.imencode(".jpg", small, _JPEG)[1].tobytes()
-        return cls(jpeg, width, height, lanes, horizon, frame.exhaustive, frame.group)
+        return cls(jpeg, width, height, lanes, horizon, frame.coverage.ego, frame.group)
 
 
 def rendered_frames(folder: Path, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
@@ -147,4 +147,4 @@ def _near(frame: LabelledFrame) -> LabelledFrame:
     lanes: tuple[LabelledLane, ...] = tuple(
         lane for lane in frame.lanes if lane.position is None or abs(lane.position) <= 2
     )
-    return LabelledFrame(frame.width, frame.height, lanes, frame.group, frame.source, frame.exhaustive)
+    return replace(frame, lanes=lanes)

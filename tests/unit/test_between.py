@@ -13,7 +13,7 @@ import pytest
 from lanestream.errors import SourceError
 from lanestream_exporter.datasets.between import Between, frames_between
 from lanestream_exporter.datasets.clips import read_clip_labels
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import PARTIAL, WHOLE, LabelledFrame
 from lanestream_exporter.patches import columns_at
 from lanestream_exporter.scenes import Drive, sample_clip, write_clip
 from lanestream_exporter.training.config import Frames, PatchData
@@ -38,7 +38,7 @@ def ego(frame: LabelledFrame) -> LabelledFrame:
 
 def ends(clip: Path) -> tuple[dict[int, LabelledFrame], dict[int, LabelledFrame]]:
     """The ego lane's labels of the first and the last frame, and those of all frames."""
-    labels = {index: ego(frame) for index, frame in read_clip_labels(clip / "drive.jsonl", exhaustive=True).items()}
+    labels = {index: ego(frame) for index, frame in read_clip_labels(clip / "drive.jsonl", WHOLE).items()}
     return {index: labels[index] for index in (0, LAST)}, labels
 
 
@@ -52,7 +52,7 @@ def test_frames_between_two_labelled_ones_are_labelled_where_the_paint_is(clip: 
     assert [frame.source for frame, _ in between] == ["drive.mp4#4", "drive.mp4#8"]
     for index, (frame, image) in zip((4, 8), between, strict=True):
         assert image.shape == (360, 640, 3)
-        assert frame.exhaustive
+        assert frame.coverage == WHOLE
         assert [lane.position for lane in frame.lanes] == [lane.position for lane in known[0].lanes]
         for lane, true in zip(frame.lanes, truth[index].lanes, strict=True):
             off = np.abs(lane.points[:, 0] - columns_at(true, lane.points[:, 1]))
@@ -68,14 +68,14 @@ def test_a_boundary_on_which_the_two_sides_differ_is_left_out(clip: Path) -> Non
     known[LAST] = replace(known[LAST], lanes=(left, aside))
     frames = followed(clip, known)
     assert [[lane.position for lane in frame.lanes] for frame in frames] == [[-1], [-1]]
-    assert not any(frame.exhaustive for frame in frames)  # what lies to the right is not known
+    assert all(frame.coverage == PARTIAL for frame in frames)  # what lies to the right is not known
 
 
 def test_a_boundary_that_only_one_side_names_is_unknown_between(clip: Path) -> None:
     known, _ = ends(clip)
     known[LAST] = replace(known[LAST], lanes=known[LAST].lanes[:1])
     assert [[lane.position for lane in frame.lanes] for frame in followed(clip, known)] == [[-1], [-1]]
-    assert not any(frame.exhaustive for frame in followed(clip, known))
+    assert all(frame.coverage == PARTIAL for frame in followed(clip, known))
     nameless = {i: replace(f, lanes=tuple(replace(lane, lane_id=None) for lane in f.lanes)) for i, f in known.items()}
     assert followed(clip, nameless) == []
 
@@ -86,7 +86,7 @@ def test_a_name_that_two_boundaries_have_is_no_name(clip: Path) -> None:
     known[0] = replace(known[0], lanes=(left, replace(left, lane_id=right.lane_id), right))
     frames = followed(clip, known)
     assert [[lane.position for lane in frame.lanes] for frame in frames] == [[-1], [-1]]
-    assert not any(frame.exhaustive for frame in frames)
+    assert all(frame.coverage == PARTIAL for frame in frames)
 
 
 def test_labelled_frames_too_far_apart_tell_nothing_of_those_between(clip: Path) -> None:

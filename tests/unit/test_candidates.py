@@ -12,6 +12,7 @@ from lanestream.detection.prior import RoadPrior, SeenBoundary
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve
+from lanestream_exporter.datasets.labels import WHOLE
 from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
 from lanestream_exporter.patches import TRUE, TruthRule, fitted_candidate
 from lanestream_exporter.scenes import Drive, RenderedFrame, render_still, sample_clip
@@ -35,7 +36,7 @@ def test_the_ego_boundaries_are_proposed_at_any_size(width: int, height: int) ->
     assert proposals.view.horizon == pytest.approx(still.horizon, abs=0.04 * height)
     rule = TruthRule(near=16.0)
     for lane in ego_labels(still.labels):
-        alone = type(still.labels)(width, height, (lane,), "scene", "rendered", exhaustive=True)
+        alone = type(still.labels)(width, height, (lane,), "scene", "rendered", WHOLE)
         assert TRUE in rule.judge(proposals.candidates, alone, proposals.view)
 
 

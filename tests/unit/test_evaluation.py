@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lanestream.detection import Prepared
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
 from lanestream_exporter.evaluation import culane, tusimple
 from lanestream_exporter.evaluation.bootstrap import blocks, intervals, measured, ratio
 from lanestream_exporter.evaluation.boundaries import Found, match, match_ego
@@ -37,8 +37,8 @@ def label(b: float, top: float = 240.0, position: int | None = None, lane_id: in
     return LabelledLane(np.stack([x, rows], axis=1)[inside], lane_id, position)
 
 
-def frame(*lanes: LabelledLane, exhaustive: bool = False, group: str = "drive", number: int = 0) -> LabelledFrame:
-    return LabelledFrame(1280, 720, lanes, group, f"{group}#{number}", exhaustive)
+def frame(*lanes: LabelledLane, coverage: Coverage = PARTIAL, group: str = "drive", number: int = 0) -> LabelledFrame:
+    return LabelledFrame(1280, 720, lanes, group, f"{group}#{number}", coverage)
 
 
 def found(b: float, position: int, v: float = 640.0, track_id: int | None = None) -> Found:
@@ -62,19 +62,19 @@ def test_an_ego_report_must_be_on_its_own_side() -> None:
     assert (len(verdict.pairs), verdict.wrong, verdict.missed) == (0, 2, 2)
 
 
-def test_an_absent_side_counts_where_labels_name_all_there_is() -> None:
+def test_an_absent_side_counts_where_the_ego_lane_is_wholly_labelled() -> None:
     alone = label(1.1, position=1)
-    verdict = match_ego([found(1.1, 1)], frame(alone, exhaustive=True))
+    verdict = match_ego([found(1.1, 1)], frame(alone, coverage=EGO_LANE))
     assert (len(verdict.pairs), verdict.wrong, verdict.missed, verdict.absent) == (1, 0, 0, 1)
     assert match_ego([found(1.1, 1)], frame(alone)).absent == 0
-    reported = match_ego([found(-1.1, -1)], frame(alone, exhaustive=True))
+    reported = match_ego([found(-1.1, -1)], frame(alone, coverage=EGO_LANE))
     assert (reported.wrong, reported.missed, reported.absent) == (1, 1, 0)
 
 
 def test_boundary_figures_of_two_frames() -> None:
     outcomes = [
-        Outcome(frame(*PAIR, exhaustive=True), (found(-1.1, -1, 650.0), found(1.1, 1))),
-        Outcome(frame(*PAIR, exhaustive=True), (found(-1.1, -1), found(0.3, 1))),
+        Outcome(frame(*PAIR, coverage=WHOLE), (found(-1.1, -1, 650.0), found(1.1, 1))),
+        Outcome(frame(*PAIR, coverage=WHOLE), (found(-1.1, -1), found(0.3, 1))),
     ]
     ego = boundary_figures(outcomes)["ego"]
     assert (ego["right"], ego["wrong"], ego["missed"], ego["absent"]) == (3, 1, 1, 0)
@@ -103,7 +103,7 @@ def test_lateral_errors_by_the_formula_and_straight_on() -> None:
 
 
 def test_figures_of_nothing_are_null() -> None:
-    figures = boundary_figures([Outcome(frame(exhaustive=True), ())])
+    figures = boundary_figures([Outcome(frame(coverage=WHOLE), ())])
     assert figures["all"]["precision"] is None
     assert figures["all"]["mean_error_px_640"] is None
     assert figures["ego"]["accuracy"] == 1.0
@@ -262,7 +262,7 @@ def test_field_figures_over_a_set() -> None:
 
 def test_candidates_under_both_rules() -> None:
     view = RoadView(1280, 720, 200.0)
-    labels = frame(*PAIR, exhaustive=True)
+    labels = frame(*PAIR, coverage=WHOLE)
     # Across the line 10 px are 6.7 px, 52 px are 35 px (of 1280) and 90 px are 60 px.
     shifts = (0.0, 10.0, 52.0, 90.0)
     candidates = tuple(Candidate(curve(-1.1, 640.0 + v), 252.0, 719.0, 1.0) for v in shifts)

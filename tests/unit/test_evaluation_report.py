@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from lanestream.engine import load_engine
 from lanestream.errors import LabelError
 from lanestream.lanes import Image
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame
 from lanestream_exporter.datasets.splits import LabelledClip
 from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, Material, evaluate
@@ -80,7 +80,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> LabelledClip:
     made = sample_clip(rng, 320, 180, frames=8, fps=25.0, drive=Drive("highway", fair=True))
     video, labels = folder / "road.mp4", folder / "road.jsonl"
     write_clip(made, video, labels)
-    return LabelledClip("road", video, labels, range(1000), exhaustive=True)
+    return LabelledClip("road", video, labels, range(1000), WHOLE)
 
 
 @pytest.fixture(scope="module")

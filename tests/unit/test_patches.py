@@ -11,7 +11,7 @@ from lanestream.errors import LabelError
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve
 from lanestream_exporter.datasets.clips import read_clip_labels
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
 from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
 from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, UNSURE, TruthRule, fitted_candidate
 from lanestream_exporter.patchstore import read_stores, write_store
@@ -28,8 +28,8 @@ def label(b: float, top: float = 340.0, bottom: float = 700.0, position: int | N
     return LabelledLane(np.stack([curve(b).x(rows), rows], axis=1), position=position)
 
 
-def frame(*lanes: LabelledLane, exhaustive: bool = False) -> LabelledFrame:
-    return LabelledFrame(1280, 720, lanes, "clip", "clip#0", exhaustive)
+def frame(*lanes: LabelledLane, coverage: Coverage = PARTIAL) -> LabelledFrame:
+    return LabelledFrame(1280, 720, lanes, "clip", "clip#0", coverage)
 
 
 def candidate(b: float, v: float = 640.0) -> Candidate:
@@ -52,9 +52,33 @@ def test_verdicts(b: float, v: float, verdict: int) -> None:
     assert rule.judge([candidate(b, v)], labels, VIEW).tolist() == [verdict]
 
 
-def test_beyond_the_labels_of_an_exhaustive_frame_a_candidate_is_false() -> None:
-    labels = frame(label(-1.1), label(1.1), exhaustive=True)
+def test_beyond_the_labels_of_a_wholly_labelled_frame_a_candidate_is_false() -> None:
+    labels = frame(label(-1.1), label(1.1), coverage=WHOLE)
     assert TruthRule().judge([candidate(2.5)], labels, VIEW).tolist() == [FALSE]
+
+
+@pytest.mark.parametrize(
+    ("coverage", "verdicts"),
+    [
+        (EGO_LANE, [UNKNOWN, UNKNOWN]),
+        (Coverage(open_sides=(1,)), [FALSE, UNKNOWN]),
+        (Coverage(open_sides=(-1,)), [UNKNOWN, FALSE]),
+    ],
+)
+def test_beyond_the_labels_a_candidate_is_unknown_where_the_side_is_open(
+    coverage: Coverage, verdicts: list[int]
+) -> None:
+    labels = frame(label(-1.1, position=-1), label(1.1, position=1), coverage=coverage)
+    assert TruthRule().judge([candidate(-2.5), candidate(2.5)], labels, VIEW).tolist() == verdicts
+    for b, verdict in zip((-2.5, 2.5), verdicts, strict=True):
+        tally = Tally()
+        count(tally, [found(b)], labels.lanes, labels)
+        assert tally.wrong == (verdict == FALSE)
+
+
+def test_beside_an_ego_boundary_that_is_absent_there_is_nothing() -> None:
+    labels = frame(label(1.1, position=1), coverage=EGO_LANE)
+    assert TruthRule().judge([candidate(-2.5), candidate(2.5)], labels, VIEW).tolist() == [FALSE, UNKNOWN]
 
 
 def test_a_short_overlap_is_not_enough_to_be_true() -> None:
@@ -82,7 +106,7 @@ def test_boundaries_are_matched_one_to_one() -> None:
     count(tally, [found(-1.1), found(-3.3)], [label(-1.1)], frame(label(-1.1), label(1.1)))
     assert (tally.right, tally.wrong, tally.missed) == (1, 0, 0)  # the second lies beyond it: nobody knows
     tally = Tally()
-    count(tally, [found(-1.1), found(-1.1, 645.0)], [label(-1.1)], frame(label(-1.1), exhaustive=True))
+    count(tally, [found(-1.1), found(-1.1, 645.0)], [label(-1.1)], frame(label(-1.1), coverage=WHOLE))
     assert (tally.right, tally.wrong, tally.missed) == (1, 1, 0)
     assert tally.errors == pytest.approx([0.0], abs=1e-9)
 
@@ -90,13 +114,13 @@ def test_boundaries_are_matched_one_to_one() -> None:
 def test_far_off_or_short_ones_are_wrong_and_the_label_is_missed() -> None:
     for wrong in (found(-1.1, 700.0), found(-1.1, top=600.0)):
         tally = Tally()
-        count(tally, [wrong], [label(-1.1)], frame(label(-1.1), exhaustive=True))
+        count(tally, [wrong], [label(-1.1)], frame(label(-1.1), coverage=WHOLE))
         assert (tally.right, tally.wrong, tally.missed) == (0, 1, 1)
 
 
 def test_errors_are_told_at_640_pixels_of_width() -> None:
     tally = Tally()
-    count(tally, [found(0.0, 650.0)], [label(0.0)], frame(label(0.0), exhaustive=True))
+    count(tally, [found(0.0, 650.0)], [label(0.0)], frame(label(0.0), coverage=WHOLE))
     assert tally.mean_error == pytest.approx(5.0)
 
 

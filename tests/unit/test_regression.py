@@ -18,7 +18,7 @@ from lanestream.lanes import Curve, Image
 from lanestream_exporter.alexnet import Shape
 from lanestream_exporter.canvases import SHARES, Warp, plain_warp, sample
 from lanestream_exporter.datasets.horizons import shared_horizon
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
 from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss, logs_at_shares
 from lanestream_exporter.roadframes import RoadFrame, read_frames, write_frames
 
@@ -47,7 +47,7 @@ def points(curve: Curve) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def frame() -> RoadFrame:
     lanes = tuple(LabelledLane(points(curve)) for curve in (LEFT, RIGHT))
-    made = RoadFrame.of(LabelledFrame(WIDTH, HEIGHT, lanes, "drive", "drawn", exhaustive=True), road())
+    made = RoadFrame.of(LabelledFrame(WIDTH, HEIGHT, lanes, "drive", "drawn", WHOLE), road())
     assert made is not None
     return made
 

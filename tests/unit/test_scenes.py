@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from lanestream_exporter.datasets.labels import WHOLE
 from lanestream_exporter.scenes import Drive, render_clip, render_still, sample_clip, sample_scene, write_clip
 from lanestream_exporter.scenes.camera import Camera
 from lanestream_exporter.scenes.dice import Dice
@@ -139,11 +140,11 @@ def test_labels_end_where_a_wall_hides_the_road(plain: Scene) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_sampled_labels_are_inside_ordered_and_exhaustive(seed: int) -> None:
+def test_sampled_labels_are_inside_ordered_and_whole(seed: int) -> None:
     frame = render_still(sample_scene(np.random.default_rng(seed), 320, 180))
     assert frame.image.shape == (180, 320, 3)
     assert frame.image.dtype == np.uint8
-    assert frame.labels.exhaustive
+    assert frame.labels.coverage == WHOLE
     for lane in frame.labels.lanes:
         x, y = lane.points.T
         assert (x >= 0).all()

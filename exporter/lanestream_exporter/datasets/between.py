@@ -23,7 +23,7 @@ from lanestream.errors import LabelError
 from lanestream.geometry import RoadView
 from lanestream.lanes import Candidate, Curve, FloatArray, Image
 from lanestream_exporter.datasets.horizons import drive_horizons
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import PARTIAL, LabelledFrame, LabelledLane
 from lanestream_exporter.datasets.pictures import Opener, Picture
 from lanestream_exporter.datasets.polylines import fitted_curve
 from lanestream_exporter.datasets.reading import survey
@@ -87,8 +87,8 @@ class Between:
             ]
             lanes = tuple(lane for lane in told if lane is not None)
             if lanes:
-                exhaustive = whole and len(lanes) == len(names)
-                yield first.index + step, replace(nearer.frame, lanes=lanes, exhaustive=exhaustive), images[step]
+                coverage = nearer.frame.coverage if whole and len(lanes) == len(names) else PARTIAL
+                yield first.index + step, replace(nearer.frame, lanes=lanes, coverage=coverage), images[step]
 
     def _followed(
         self, curves: Sequence[Curve], road: Sequence[_Moment], images: Sequence[Image]
@@ -130,7 +130,7 @@ class _Line:
 class _End:
     """A labelled frame at one end of a stretch: its boundaries by their names, those whose name is theirs alone.
 
-    `whole` says that all that can be told of the frame is in them.
+    `whole` says that all labels of the frame are in them.
     """
 
     def __init__(self, index: int, frame: LabelledFrame, horizon: float) -> None:
@@ -140,7 +140,7 @@ class _End:
         named = {lane.lane_id: lane for lane in frame.lanes if lane.lane_id is not None and times[lane.lane_id] == 1}
         lines = {name: self._line(lane) for name, lane in named.items()}
         self.lines = {name: line for name, line in lines.items() if line is not None}
-        self.whole = frame.exhaustive and len(self.lines) == len(frame.lanes)
+        self.whole = len(self.lines) == len(frame.lanes)
 
     def _line(self, lane: LabelledLane) -> _Line | None:
         points = lane.points[lane.points[:, 1] > self.view.row_at(_TOP_SHARE)]

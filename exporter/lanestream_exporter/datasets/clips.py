@@ -13,7 +13,7 @@ from lanestream.errors import LabelError, SourceError
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.entries import Entries, Entry, numbered, size_of
 from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import PARTIAL, Coverage, LabelledFrame, LabelledLane
 from lanestream_exporter.datasets.pictures import Picture
 from lanestream_exporter.datasets.polylines import points_of
 from lanestream_exporter.datasets.records import all_records, placed, records, unusable
@@ -23,25 +23,25 @@ _NEEDED = "frame, width, height and lanes"
 _TOLD: Final[Mapping[str, type]] = {"id": int, "position": int, "type": str, "color": str}
 
 
-def read_clip_labels(path: Path, exhaustive: bool = False) -> dict[int, LabelledFrame]:
-    """Labelled frames by their index in the clip; `exhaustive` says that the labels name all that can be told.
+def read_clip_labels(path: Path, coverage: Coverage = PARTIAL) -> dict[int, LabelledFrame]:
+    """Labelled frames by their index in the clip; `coverage` says what the labels may have left out.
 
     Raises LabelError that names the file and the line.
     """
     frames: dict[int, LabelledFrame] = {}
     for place, record in records(path):
         try:
-            frames[int(record["frame"])] = _frame(record, path, exhaustive)
+            frames[int(record["frame"])] = _frame(record, path, coverage)
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise unusable(place, error, _NEEDED) from error
     return frames
 
 
-def _frame(record: dict[str, Any], path: Path, exhaustive: bool) -> LabelledFrame:
+def _frame(record: dict[str, Any], path: Path, coverage: Coverage) -> LabelledFrame:
     lanes = tuple(_lanes(record))
     clip = str(record.get("clip", path.stem))
     source = f"{clip}#{record['frame']}"
-    return LabelledFrame(int(record["width"]), int(record["height"]), lanes, Path(clip).stem, source, exhaustive)
+    return LabelledFrame(int(record["width"]), int(record["height"]), lanes, Path(clip).stem, source, coverage)
 
 
 def _lanes(record: dict[str, Any]) -> Iterator[LabelledLane]:
@@ -62,9 +62,9 @@ def _told(lane: dict[str, Any], name: str, kind: type) -> Any:
     return value
 
 
-def read_clip(video: Path, labels: Path) -> Iterator[tuple[LabelledFrame, Image]]:
+def read_clip(video: Path, labels: Path, coverage: Coverage = PARTIAL) -> Iterator[tuple[LabelledFrame, Image]]:
     """The labelled frames of a clip with their BGR images (H, W, 3), in order. Raises SourceError, LabelError."""
-    wanted = read_clip_labels(labels)
+    wanted = read_clip_labels(labels, coverage)
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
         raise SourceError(f"{video} can't be read as a video", "give the path of a video file")

@@ -25,11 +25,27 @@ class LabelledLane:
 
 
 @dataclass(frozen=True)
-class LabelledFrame:
-    """The labels of one frame: its size in pixels and its lane boundaries.
+class Coverage:
+    """What labels may have left out.
 
-    `exhaustive` says that every visible boundary is labelled; where it is False, what lies outside the outermost
-    label is unknown rather than absent. `group` names the drive or clip, the unit that a split may not divide.
+    `ego`: the ego lane's boundaries are labelled wherever they can be told, so that one without a label is absent.
+    `open_sides`: the sides, -1 left and 1 right, on which there may be more boundaries beyond the outermost label.
+    """
+
+    ego: bool = False
+    open_sides: tuple[int, ...] = (-1, 1)
+
+
+PARTIAL = Coverage()
+EGO_LANE = Coverage(ego=True)
+WHOLE = Coverage(ego=True, open_sides=())
+
+
+@dataclass(frozen=True)
+class LabelledFrame:
+    """The labels of one frame: its size in pixels, its lane boundaries, and what they cover.
+
+    `group` names the drive or clip, the unit that a split may not divide.
     """
 
     width: int
@@ -37,4 +53,12 @@ class LabelledFrame:
     lanes: tuple[LabelledLane, ...]
     group: str
     source: str
-    exhaustive: bool = False
+    coverage: Coverage = PARTIAL
+
+    def open_to(self, side: int) -> bool:
+        """Whether a boundary beyond the outermost label on that side, -1 left or 1 right, is unknown, not absent.
+
+        Where the ego lane's boundary of the side is known to be absent, those farther out can't be seen either.
+        """
+        labelled = any((lane.position or 0) * side > 0 for lane in self.lanes)
+        return side in self.coverage.open_sides and (labelled or not self.coverage.ego)

@@ -17,16 +17,17 @@ from lanestream.errors import LabelError
 from lanestream.lanes import Image
 from lanestream_exporter.datasets.between import Between
 from lanestream_exporter.datasets.clips import read_clip, read_clip_labels
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, Coverage, LabelledFrame
 from lanestream_exporter.datasets.records import records
 from lanestream_exporter.datasets.tusimple import read_tusimple
 
 Split = Literal["train", "val", "test"]
 
-_CLIPS: dict[Split, tuple[str, ...]] = {
-    "train": ("highway_project_8s", "highway_concrete"),
-    "val": (),
-    "test": ("highway_white_right",),
+# Left of the yellow line of the first two is a barrier: what looks like a boundary there is none.
+_CLIPS: dict[Split, dict[str, Coverage]] = {
+    "train": {"highway_project_8s": Coverage(open_sides=(1,)), "highway_concrete": Coverage(open_sides=(1,))},
+    "val": {},
+    "test": {"highway_white_right": PARTIAL},
 }
 
 # The country road is one drive: cut by time, with the stretch between two parts left out of neither but never shared.
@@ -47,9 +48,8 @@ def data_root(given: Path | None = None) -> Path:
 def real_frames(root: Path, split: Split) -> Iterator[tuple[LabelledFrame, Image]]:
     """All labelled real frames of a split with their BGR images, drive after drive."""
     yield from read_tusimple(root / "tusimple", split)
-    for name in _CLIPS[split]:
-        clip = highway_clip(root, name)
-        yield from read_clip(clip.video, clip.labels)
+    for clip in _highway_clips(root, split):
+        yield from read_clip(clip.video, clip.labels, clip.coverage)
     yield from _country_frames(root / "udacity_ch2", _COUNTRY_FRAMES[split])
 
 
@@ -59,28 +59,25 @@ def training_frames(root: Path, between: Between | None) -> Iterator[tuple[Label
     if between is None:
         return
     for clip in labelled_clips(root, "train"):
-        labelled = read_clip_labels(clip.labels, clip.exhaustive)
+        labelled = read_clip_labels(clip.labels, clip.coverage)
         yield from between.frames(clip.video, {i: frame for i, frame in labelled.items() if i in clip.frames})
 
 
 @dataclass(frozen=True)
 class LabelledClip:
-    """A video with key-frame labels, and the stretch of its frames that belongs to a split.
-
-    `exhaustive` says that the labels name every boundary that can be told.
-    """
+    """A video with key-frame labels, what they cover, and the stretch of its frames that belongs to a split."""
 
     name: str
     video: Path
     labels: Path
     frames: range
-    exhaustive: bool = False
+    coverage: Coverage = PARTIAL
 
 
-def highway_clip(root: Path, name: str) -> LabelledClip:
+def highway_clip(root: Path, name: str, coverage: Coverage = PARTIAL) -> LabelledClip:
     """One of the labelled highway clips, whole."""
-    folder = root / "udacity"
-    return LabelledClip(name, folder / "clips" / f"{name}.mp4", folder / "labels" / f"{name}.jsonl", range(1_000_000))
+    video, labels = root / "udacity/clips" / f"{name}.mp4", root / "udacity/labels" / f"{name}.jsonl"
+    return LabelledClip(name, video, labels, range(1_000_000), coverage)
 
 
 def labelled_clips(root: Path, split: Split) -> list[LabelledClip]:
@@ -88,16 +85,20 @@ def labelled_clips(root: Path, split: Split) -> list[LabelledClip]:
     country = root / "udacity_ch2"
     video, labels = country / "country_road_140s.mp4", country / "labels.jsonl"
     return [
-        *(highway_clip(root, name) for name in _CLIPS[split]),
-        LabelledClip("country_road", video, labels, _COUNTRY_FRAMES[split], exhaustive=True),
+        *_highway_clips(root, split),
+        LabelledClip("country_road", video, labels, _COUNTRY_FRAMES[split], EGO_LANE),
     ]
+
+
+def _highway_clips(root: Path, split: Split) -> list[LabelledClip]:
+    return [highway_clip(root, name, coverage) for name, coverage in _CLIPS[split].items()]
 
 
 def _country_frames(root: Path, wanted: range) -> Iterator[tuple[LabelledFrame, Image]]:
     """Labelled frames of the country road from the original JPEGs, which the video has compressed once more."""
     labels = root / "labels.jsonl"
     images = {int(record["frame"]): str(record["image"]) for _, record in records(labels)}
-    for index, frame in read_clip_labels(labels, exhaustive=True).items():
+    for index, frame in read_clip_labels(labels, EGO_LANE).items():
         if index in wanted:
             image = cv2.imread(str(root / images[index]))
             if image is None:

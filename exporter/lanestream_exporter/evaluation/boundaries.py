@@ -116,8 +116,8 @@ def count(tally: Tally, found: Sequence[Found], labels: Sequence[LabelledLane], 
 def match(found: Sequence[Found], labels: Sequence[LabelledLane], frame: LabelledFrame) -> Verdict:
     """The reported boundaries against `labels`, each matched at most once.
 
-    Where the frame is not exhaustively labelled, a report beyond its outermost labels is neither right nor wrong,
-    unless it repeats one of them.
+    A report beyond the outermost label of a side that is not wholly labelled is neither right nor wrong, unless it
+    repeats a label.
     """
     distances = np.array([[_distance(f, label, frame.width) for label in labels] for f in found])
     chosen = _pairs(distances)
@@ -132,8 +132,8 @@ def match(found: Sequence[Found], labels: Sequence[LabelledLane], frame: Labelle
 def match_ego(found: Sequence[Found], frame: LabelledFrame) -> Verdict:
     """The reported ego boundaries against the labelled ones, side by side.
 
-    What is reported for a side that has a label is right or wrong, wherever it lies. A side of an exhaustively labelled
-    frame without label and without report is rightly absent.
+    What is reported for a side that has a label is right or wrong, wherever it lies. A side without label and without
+    report is rightly absent where the ego lane is wholly labelled.
     """
     pairs: list[Pair] = []
     wrong = missed = absent = 0
@@ -141,7 +141,7 @@ def match_ego(found: Sequence[Found], frame: LabelledFrame) -> Verdict:
         reported = [i for i, f in enumerate(found) if f.position == side]
         if label is None:
             wrong += sum(1 for i in reported if not _beyond_labels(found[i], frame))
-            absent += frame.exhaustive and not reported
+            absent += frame.coverage.ego and not reported
             continue
         best = min(((_distance(found[i], label, frame.width), i) for i in reported), default=(np.inf, -1))
         right = bool(np.isfinite(best[0]))
@@ -202,14 +202,15 @@ def _pairs(distances: FloatArray) -> list[tuple[int, int]]:
 
 
 def _beyond_labels(found: Found, frame: LabelledFrame) -> bool:
-    if frame.exhaustive or not frame.lanes:
+    """Whether half of it lies beside the outermost label of an open side, where there is a label to compare with."""
+    if not frame.lanes:
         return False
     rows = np.linspace(found.top, found.bottom, 16)
     columns = found.curve.x(rows)
     labelled = np.stack([columns_at(lane, rows) for lane in frame.lanes])
     known = ~np.isnan(labelled).all(axis=0)
     if not known.any():
-        return True
+        return frame.open_to(-1) or frame.open_to(1)
     left, right = np.nanmin(labelled[:, known], axis=0), np.nanmax(labelled[:, known], axis=0)
-    inside = (columns[known] > left) & (columns[known] < right)
-    return bool(inside.mean() <= 0.5)
+    beside = {-1: columns[known] <= left, 1: columns[known] >= right}
+    return any(frame.open_to(side) and share.mean() >= 0.5 for side, share in beside.items())

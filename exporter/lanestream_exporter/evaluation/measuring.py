@@ -135,7 +135,7 @@ def evaluate(methods: Sequence[Method], material: Material, tell: Callable[[str]
 
 
 def _follow(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]:
-    wanted = read_clip_labels(clip.labels, clip.exhaustive)
+    wanted = read_clip_labels(clip.labels, clip.coverage)
     runs = {method.name: ClipRun() for method in methods}
     followers = {method.name: method.follow() for method in methods}
     for index, image, timestamp in _decoded(clip.video, clip.frames):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
 
 if TYPE_CHECKING:
     from lanestream_exporter.scenes.camera import FloatArray
@@ -34,7 +34,7 @@ def annotate(scene: Scene, view: RoadView, hidden: Image) -> LabelledFrame:
             continue
         colour = boundary.marking.color if boundary.marking else None
         lanes.append(LabelledLane(points, lane_id, position, boundary.kind, colour))
-    return LabelledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, exhaustive=True)
+    return LabelledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, WHOLE)
 
 
 def _rows(scene: Scene, view: RoadView) -> FloatArray:
