@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: bench soak evaluate proposals demo serve train-toy test lint asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: bench soak evaluate proposals models demo serve train-toy test lint asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -42,6 +42,17 @@ lint: $(DEV_READY)
 	$(BIN)/mypy
 
 MODELS := service/lanestream/models
+
+# Networks like the shipped ones, into out/: hours of a CPU's work, which goes on where it was stopped.
+models: $(DEV_READY)
+	$(BIN)/lanestream train classifier --run runs/classifier
+	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
+	$(BIN)/lanestream train regressor --run runs/regressor
+	$(BIN)/lanestream train regressor regressor-second --run runs/regressor-second
+	mkdir -p out
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx --precision fp32
+	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx
 
 evaluate: $(DEV_READY)
 	$(BIN)/lanestream evaluate --split test --model $(MODELS)/classifier.onnx --model $(MODELS)/regressor.onnx \

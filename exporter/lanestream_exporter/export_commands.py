@@ -133,7 +133,7 @@ def _tell(out: Path, report: ExportReport, source: FrameSource) -> None:
     if report.time_ratio is not None:
         ratio = f"{report.time_ratio:.2f} of the time ({report.timed_by})"
         click.echo(f"{report.written.name} against fp32, the same network: {ratio}")
-    click.echo(f"{out}: {report.written.size or 0:,} bytes")
+    click.echo(f"{out}: {out.stat().st_size:,} bytes")
 
 
 def _cells(row: Measured) -> list[str]:

@@ -150,8 +150,9 @@ def test_the_shipped_configurations_are_read() -> None:
     assert read_config(Path("classifier"), ClassifierConfig) == ClassifierConfig()
     regressor = read_config(Path("regressor"), RegressorConfig)
     assert regressor.model_copy(update={"initial": None}) == RegressorConfig()
-    again = read_config(Path("regressor-again"), RegressorConfig)
-    assert (again.initial, again.steps) == ("runs/first/best.pt", regressor.steps)
+    second = read_config(Path("regressor-second"), RegressorConfig)
+    assert (second.initial, second.steps) == ("runs/regressor/best.pt", regressor.steps)
+    assert read_config(Path("classifier-second"), ClassifierConfig).initial == "runs/classifier/best.pt"
     published = read_config(SHIPPED / "classifier-published.toml", ClassifierConfig)
     assert published.optimiser == Sgd(kind="sgd", learning_rate=0.001, momentum=0.9, weight_decay=1e-4)
     assert published.batch == 15

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score
 from torch import Tensor, nn
 
+from lanestream import __version__
 from lanestream.detection import Prepared
 from lanestream.detection.detector import TRUE_LANE, CandidateDetector
 from lanestream.detection.strips import StripCutter
@@ -24,7 +25,7 @@ from lanestream_exporter.exporting.compression import in_batches, truncated
 from lanestream_exporter.exporting.frames import FrameSource, LabelledJpeg, Part
 from lanestream_exporter.exporting.normalisation import NORMALISATIONS
 from lanestream_exporter.exporting.subject import Check, Description, Figures
-from lanestream_exporter.exporting.versions import exporter, product
+from lanestream_exporter.exporting.versions import exporter
 from lanestream_exporter.patches import FALSE, TRUE, TruthRule
 
 _MOST_RANGING: Final = 1024
@@ -123,7 +124,7 @@ class ClassifierSubject:
         return ClassifierInfo(
             kind="classifier",
             name=description.name,
-            version=product(),
+            version=__version__,
             classes=self.classes,
             strip=strip,
             temperature=self.calibration.temperature,

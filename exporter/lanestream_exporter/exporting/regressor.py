@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 from torch import Tensor, nn
 
+from lanestream import __version__
 from lanestream.detection.regression import RegressionDetector
 from lanestream.geometry import CanvasGeometry
 from lanestream.imaging import ImageLimits, decode
@@ -24,7 +25,7 @@ from lanestream_exporter.exporting.compression import in_batches, truncated
 from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.normalisation import contrast
 from lanestream_exporter.exporting.subject import Check, Description, Figures
-from lanestream_exporter.exporting.versions import exporter, product
+from lanestream_exporter.exporting.versions import exporter
 from lanestream_exporter.regressor import Answer, LaneRegressor
 from lanestream_exporter.roadframes import RoadFrame
 
@@ -148,7 +149,7 @@ class RegressorSubject:
         return RegressorInfo(
             kind="regressor",
             name=description.name,
-            version=product(),
+            version=__version__,
             canvas=canvas,
             threshold=self.calibration.threshold,
             precision=description.precision,

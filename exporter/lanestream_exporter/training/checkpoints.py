@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from lanestream import __version__
 from lanestream.errors import CheckpointError
 from lanestream_exporter.alexnet import load_state
 
@@ -30,7 +30,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def made_by() -> dict[str, Any]:
     """The versions of the program and of PyTorch, and the program's git revision where it runs from a checkout."""
-    return {"lanestream": version("lanestream"), "torch": str(torch.__version__), "revision": revision()}
+    return {"lanestream": __version__, "torch": str(torch.__version__), "revision": revision()}
 
 
 def revision() -> str | None:
