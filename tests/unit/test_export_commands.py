@@ -71,13 +71,16 @@ def test_the_table_compares_size_accuracy_and_time(tmp_path: Path, capsys: pytes
     with torch.device("meta"):
         subject = ClassifierSubject(AlexNet(normalised=False))
     report = ExportReport(subject, 20, 300, *rows, Boundaries(80, 1, 0.1, 2.5), "openvino")
-    export_commands._tell(tmp_path / "out.onnx", report, FrameSource(None))
+    out = tmp_path / "out.onnx"
+    out.write_bytes(bytes(1234))  # the figures are written into the file after it has been measured
+    export_commands._tell(out, report, FrameSource(None))
     told = capsys.readouterr().out
     assert "300 inputs of 20 validation frames: rendered scenes" in told
     assert "int8 against checkpoint: 0.30 points of accuracy lost" in told
     assert "int8 against fp32: 0.20 points of accuracy lost" in told
     assert "int8 against fp32, the same network: 0.30 of the time (openvino)" in told
     assert "80 by PyTorch and by the file, 1 by one alone" in told
+    assert "1,234 bytes" in told
     for cell in ("12.0 MB", "3.0 MB", "4.00 ms", "1.20 ms", "0.9470"):
         assert cell in told
 
