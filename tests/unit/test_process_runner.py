@@ -140,6 +140,19 @@ async def test_a_worker_that_hangs_is_ended_and_replaced(caplog: pytest.LogCaptu
         assert runner.pids != (first,)
 
 
+async def test_a_service_that_was_suspended_goes_on_with_the_same_workers() -> None:
+    async with started(fakes.engine, patience_s=1.0) as runner:
+        camera = runner.open_camera()
+        (first,) = runner.pids
+        os.kill(first, signal.SIGSTOP)
+        answer = asyncio.create_task(runner.run(camera, frame()))
+        await asyncio.sleep(0.05)
+        time.sleep(1.5)  # the event loop is as suspended as the worker
+        os.kill(first, signal.SIGCONT)
+        assert (await answer).result.lanes
+        assert runner.pids == (first,)
+
+
 async def test_a_deadline_holds_in_the_worker_too() -> None:
     async with started(fakes.engine) as runner:
         late = EncodedFrame(fakes.image_file(), 0.0, time.monotonic(), deadline=time.monotonic() - 1.0)

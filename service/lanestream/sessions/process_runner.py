@@ -40,6 +40,8 @@ _LONGEST_RESTART_S: Final = 30.0
 _END_S: Final = 10.0
 # A frame takes a worker a fraction of a second, many seconds on a busy machine: one that has had it for longer hangs.
 _PATIENCE_S: Final = 30.0
+# In how many parts that is waited for: a service that was suspended finds one of them over when it goes on, not all.
+_LOOKS: Final = 10
 
 
 class RemoteCamera:
@@ -107,15 +109,23 @@ class Worker:
         self._writer.write(packed(threads))
         self._listening = asyncio.create_task(self._listen())
 
-    async def ask(self, camera: RemoteCamera, frame: EncodedFrame, *, crowded: bool) -> Done:
-        """What it makes of a frame. Raises WorkerLostError where it ends before."""
+    async def ask(self, camera: RemoteCamera, frame: EncodedFrame, patience_s: float, *, crowded: bool) -> Done:
+        """What it makes of a frame.
+
+        Raises WorkerLostError where it ends before, TimeoutError where that takes `patience_s` seconds. Time in which
+        the service itself was suspended, with its container say, hardly counts: the worker was suspended, too.
+        """
         number = next(self._numbers)
         answer: asyncio.Future[Done] = asyncio.get_running_loop().create_future()
         self._asked[number] = answer
         job = Job(number, frame, camera.state, camera.horizon, camera.detector, crowded)
         self._writer.write(packed(job))
         try:
-            return await answer
+            for _ in range(_LOOKS):
+                await asyncio.wait([answer], timeout=patience_s / _LOOKS)
+                if answer.done():
+                    return answer.result()
+            raise TimeoutError
         finally:
             del self._asked[number]
 
@@ -253,8 +263,7 @@ class ProcessRunner(FrameRunner):
             raise _lost()
         worker = min(self._living, key=lambda each: each.in_work)
         try:
-            async with asyncio.timeout(self._patience_s):
-                done = await worker.ask(camera, frame, crowded=crowded)
+            done = await worker.ask(camera, frame, self._patience_s, crowded=crowded)
         except TimeoutError:
             _log.error("a worker process has been at a frame for %g s; it is ended", self._patience_s)
             await worker.kill()
