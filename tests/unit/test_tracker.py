@@ -111,6 +111,18 @@ def test_a_coasting_boundary_moves_with_those_that_are_seen() -> None:
     assert right - left == pytest.approx(LANE * VIEW.depth, rel=0.08)
 
 
+def test_a_boundary_that_is_seen_anew_elsewhere_does_not_take_a_coasting_one_along() -> None:
+    tracker = LaneTracker()
+    drive(tracker, 12, lambda _: road(0.0, (0, 1, 2)))
+    for i in range(12, 15):
+        before = tracker.update(road(0.0, (0, 1)), i * DT, VIEW)
+    after = tracker.update([detection(-0.5 * LANE), detection(1.62 * LANE)], 15 * DT, VIEW)
+    ego_right = [next(lane for lane in result.lanes if lane.position == 1) for result in (before, after)]
+    assert [lane.state for lane in ego_right] == ["detected", "predicted"]
+    near = [float(lane.curve.x(VIEW.bottom)) for lane in ego_right]
+    assert near[1] == pytest.approx(near[0], abs=1.0)
+
+
 def test_a_coasting_boundary_is_not_told_where_the_road_turns_but_keeps_its_id() -> None:
     tracker = LaneTracker()
     before = drive(tracker, 12, lambda _: road(0.0, (0, 1)))

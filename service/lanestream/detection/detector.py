@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import Findings, Prepared
+from lanestream.detection.bars import USUAL_LEANING
 from lanestream.detection.candidates import TOP_SHARE, CandidateSearch, Survey
 from lanestream.detection.prior import RoadPrior
-from lanestream.detection.refinement import USUAL_LEANING, Refinement
+from lanestream.detection.refinement import Refinement
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_spans
 from lanestream.lanes import Candidate, Curve, Detection, FloatArray, Image, curve_columns, curves_through

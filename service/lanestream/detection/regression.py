@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import Findings, Prepared
+from lanestream.detection.bars import BarSearch
 from lanestream.detection.edges import resized
 from lanestream.detection.refinement import Refinement
 from lanestream.geometry import CanvasGeometry, RoadView, Scaling, visible_spans
@@ -97,7 +98,7 @@ class RegressionDetector:
     threshold: float = 0.5
     geometry: CanvasGeometry = CanvasGeometry()
     detail_width: int = 448
-    refinement: Refinement = Refinement(reach=0.24, anchors=ANCHORS, steps=(0.09, 0.06, 0.04, 0.04))
+    refinement: Refinement = Refinement(bars=BarSearch(reach=0.24), anchors=ANCHORS, steps=(0.09, 0.06, 0.04, 0.04))
     doubt: float = 1.5
 
     def survey(self, image: Image, horizon: float | None = None) -> None:

@@ -43,6 +43,11 @@ class Track:
         return self.track_id is not None
 
     @property
+    def seen_twice(self) -> bool:
+        """Whether a detection backed it in this frame and in the last one, so that it moved as its boundary did."""
+        return len(self.hits) > 1 and self.hits[-1] and self.hits[-2]
+
+    @property
     def columns(self) -> FloatArray:
         """Columns (3,) at the tracker's rows."""
         columns: FloatArray = self.kalman.x[:3]

@@ -172,7 +172,11 @@ class LaneTracker:
 
     def _shift_coasting(self, matched: set[int], view: RoadView) -> None:
         """Moves unmatched tracks as the matched ones have moved: it was the camera, not the road."""
-        seen = [t.columns - t.previous_columns for i, t in enumerate(self._tracks) if i in matched and t.confirmed]
+        seen = [
+            track.columns - track.previous_columns
+            for i, track in enumerate(self._tracks)
+            if i in matched and track.confirmed and track.seen_twice
+        ]
         for i, track in enumerate(self._tracks):
             if i not in matched:
                 if seen:
