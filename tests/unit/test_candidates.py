@@ -100,6 +100,27 @@ def test_the_line_beside_a_boundary_of_the_prior_is_a_candidate_too_unless_bound
     assert beside(0.02, [aside]) == 0
 
 
+def test_the_boundaries_of_the_prior_are_candidates_on_the_paint_too_unless_they_are_followed_there() -> None:
+    bare = np.full((360, 640, 3), 100, np.uint8)
+    view = RoadView(640, 360, 150.0)
+    seen, painted = (Curve(150.0, (320.0, slope, 0.0)) for slope in (-1.2, -1.14))
+    prior = RoadPrior(view, SeenBoundary(seen, np.full(2, 0.05), 1.0, painted), None)
+
+    def proposed(curve: Curve, expected: list[Curve]) -> int:
+        found = CandidateSearch().propose(bare, 150.0, expected, prior).candidates
+        return sum(is_told_anew(candidate.curve, curve, view.bottom) for candidate in found)
+
+    assert [proposed(curve, []) for curve in (seen, painted)] == [1, 1]
+    assert proposed(painted, [painted]) == 1
+
+
+def test_a_glance_that_saw_no_boundary_still_tells_the_horizon() -> None:
+    bare = np.full((360, 640, 3), 100, np.uint8)
+    prior = RoadPrior(RoadView(640, 360, 180.0), None, None)
+    assert CandidateSearch().propose(bare, 150.0, (), prior).view.horizon == pytest.approx(180.0, abs=7.0)
+    assert CandidateSearch().propose(bare, 150.0).view.horizon == pytest.approx(150.0, abs=7.0)
+
+
 def test_faint_lines_are_no_candidates() -> None:
     still = fair_scene(640, 360)
     every = CandidateSearch(faintest=0.0).propose(still.image).candidates

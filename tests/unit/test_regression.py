@@ -160,6 +160,17 @@ def test_what_is_not_there_is_no_prior() -> None:
     assert len(prior.curves) == 1
 
 
+def test_a_glance_tells_its_boundaries_on_the_paint_too() -> None:
+    said = answer()
+    said[:6] += 0.012
+    said[6:12] = 0.03
+    prior = answered(RoadGlance(RegressionDetector(), Told(said)).look(road(), HORIZON))
+    rows = HORIZON + np.array(ANCHORS) * VIEW.depth
+    for seen, painted, curve in zip(prior.curves, prior.painted, (LEFT, RIGHT), strict=True):
+        assert np.abs(seen.x(rows) - curve.x(rows)).min() > 7.0
+        assert np.abs(painted.x(rows) - curve.x(rows)).max() < 2.0
+
+
 def test_labels_tell_the_horizon_they_share() -> None:
     assert shared_horizon([points(LEFT), points(RIGHT)], HEIGHT, None) == pytest.approx(HORIZON, abs=1.0)
     assert shared_horizon([points(LEFT)], HEIGHT, None) is None

@@ -117,30 +117,33 @@ class CandidateSearch:
 
         `survey` is the image's, with the same horizon, where that was made before. `expected` are boundaries that the
         last frames had. They are candidates before all others: what is still there need not be found anew. A `prior`
-        that saw a boundary gives the perspective, candidates of its own, those of the next lanes, and an order for the
-        rest; one that saw none is as good as none. Of a frame whose horizon is unknown the prior is trusted less: what
-        is found without it is proposed too.
+        that saw a boundary gives the perspective, candidates of its own, as it saw them and on the paint, those of the
+        next lanes, and an order for the rest; one that saw none tells the horizon at most. Of a frame whose horizon is
+        unknown the prior is trusted less: what is found without it is proposed too.
         """
         height, width = image.shape[:2]
         survey = survey or self.survey(image, horizon)
         grey, scaling = survey.grey, survey.scaling
         guide = prior if prior is not None and prior.curves else None
         if guide is None:
-            point, seen = self._road(grey, None if horizon is None else scaling.to_working(horizon), survey.lines)
+            # A glance that sees no boundary in the dark, or in a sharp bend, still sees where the road ends.
+            row = horizon if prior is None or horizon is None else prior.view.horizon
+            point, seen = self._road(grey, None if row is None else scaling.to_working(row), survey.lines)
         else:
             point, seen = self._seen_road(survey, guide)
         view = RoadView(grey.shape[1], grey.shape[0], point.y)
         known = Lines.along(expected, scaling, view)
         found = [self._found(seen, view, point)]
-        guides, neighbours = Lines.joined([]), Lines.joined([])
+        guides, painted, neighbours = Lines.joined([]), Lines.joined([]), Lines.joined([])
         if guide is not None:
             lattice = _lattice(guide, scaling, view, point)
             found = [found[0].weighed(lattice.trust(_slopes(found[0], view, point)))]
             if horizon is None:
                 found.append(self._unguided(grey, scaling, view))
-            guides, neighbours = Lines.along(guide.curves, scaling, view), _neighbours(lattice, view, point)
+            guides, painted = (Lines.along(curves, scaling, view) for curves in (guide.curves, guide.painted))
+            neighbours = _neighbours(lattice, view, point)
         strong = Lines.joined(found).strong(self.faintest).ranked
-        kept = self._kept(known, [guides, neighbours], strong, view)
+        kept = self._kept(known, [guides, neighbours], painted, strong, view)
         image_view = RoadView(width, height, scaling.to_image(point.y))
         candidates = _candidates(kept, _curves(kept, scaling, view, point), image_view)
         limit = min(self.limit, self.followed) if expected else self.limit
@@ -193,21 +196,21 @@ class CandidateSearch:
         weights = self.unguided * found.strength
         return Lines.along(_curves(found, scaling, own, point), scaling, view).weighed(weights)
 
-    def _kept(self, known: Lines, led: Sequence[Lines], found: Lines, view: RoadView) -> Lines:
-        """All lines that keep their distance from those before them; where none are `known`, twins of the guides too.
+    def _kept(self, known: Lines, led: Sequence[Lines], painted: Lines, found: Lines, view: RoadView) -> Lines:
+        """All lines that keep their distance from those before them, and beside the guides what may be more exact.
 
-        Those that a prior `led` to are the guides, its own boundaries, and others. A guide's twin is the first of the
-        `found` lines that is beside it, as `twin` says.
+        Those that a prior `led` to are the guides, its own boundaries, and others. Beside the guides are themselves as
+        `painted`, unless that is where a `known` one runs, and, where none are known, their twins: the first of the
+        `found` lines that is beside a guide, as `twin` says.
         """
         ranked = Lines.joined([known, *led, found])
         places = ranked.apart(self.separation, view)
-        if len(known.near):
-            return ranked.taken(places)
-        guides = led[0]
-        beside = guides.follow(found, self.separation, view) & ~guides.follow(found, self.twin, view)
-        twins = np.unique(beside.argmax(axis=1)[beside.any(axis=1)]) if len(found.near) else np.empty(0, np.intp)
-        first = places < sum(len(lines.near) for lines in led)
-        return Lines.joined([ranked.taken(places[first]), found.taken(twins), ranked.taken(places[~first])])
+        beside = [painted.taken(np.flatnonzero(~painted.follow(known, self.separation, view).any(axis=1)))]
+        if not len(known.near) and len(found.near):
+            near = led[0].follow(found, self.separation, view) & ~led[0].follow(found, self.twin, view)
+            beside.append(found.taken(np.unique(near.argmax(axis=1)[near.any(axis=1)])))
+        first = places < sum(len(lines.near) for lines in (known, *led))
+        return Lines.joined([ranked.taken(places[first]), *beside, ranked.taken(places[~first])])
 
     def _rays(self, ridges: Ridges, view: RoadView, point: Perspective) -> Lines:
         """Lines through the vanishing point along which ridges gather."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from lanestream.detection import Network, Question, Steps
 from lanestream.detection.lattice import USUAL_WIDTH, Lattice
+from lanestream.detection.refinement import Fit
 from lanestream.detection.regression import ANCHORS, RegressionDetector, RoadReading
 from lanestream.geometry import RoadView
 from lanestream.lanes import Curve, FloatArray, Image, curve_columns
@@ -38,12 +39,14 @@ class SeenBoundary:
     """An ego boundary that was seen at a glance.
 
     `curve` is in image pixels; `spread` (2,) are its standard deviations at the compared rows, in rows below the
-    horizon; `presence` is the chance that it is there at all.
+    horizon; `presence` is the chance that it is there at all. `painted` is the curve moved onto the paint beneath
+    it, where that was looked for.
     """
 
     curve: Curve
     spread: FloatArray
     presence: float
+    painted: Curve | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,11 @@ class RoadPrior:
     def curves(self) -> tuple[Curve, ...]:
         """Their curves."""
         return tuple(boundary.curve for boundary in self.seen)
+
+    @property
+    def painted(self) -> tuple[Curve, ...]:
+        """Their curves on the paint, of those for which it was looked for."""
+        return tuple(boundary.painted for boundary in self.seen if boundary.painted is not None)
 
     def odds(self, curves: Sequence[Curve]) -> FloatArray:
         """How many times likelier (N,) `curves` are boundaries because of where they run: 1 where that tells nothing.
@@ -102,15 +110,17 @@ class RoadGlance:
         reading, seen = yield from self._reading(image, horizon)
         if abs(reading.horizon) > _SECOND_LOOK:
             reading, seen = yield from self._reading(image, seen.horizon)
-        left, right = (self._seen(reading, side, seen) for side in (0, 1))
+        fits, _ = self.detector.fitted(image, reading, seen)
+        left, right = (self._seen(reading, side, seen, fits.get(side)) for side in (0, 1))
         return RoadPrior(seen, left, right)
 
-    def _seen(self, reading: RoadReading, side: int, view: RoadView) -> SeenBoundary | None:
+    def _seen(self, reading: RoadReading, side: int, view: RoadView, fit: Fit | None) -> SeenBoundary | None:
         presence = float(reading.presence[side])
         if presence < self.detector.threshold or reading.deviations[side].mean() > _MOST_DOUBT:
             return None
+        curve = reading.curve(side, view)
         spread = np.hypot(reading.deviations[side, : len(_COMPARED)] * view.width / (_COMPARED * view.depth), _EXACT)
-        return SeenBoundary(reading.curve(side, view), spread, presence)
+        return SeenBoundary(curve, spread, presence, None if fit is None else fit.curve)
 
     def _reading(self, image: Image, horizon: float | None) -> Steps[tuple[RoadReading, RoadView]]:
         prepared = self.detector.prepare(image, horizon)

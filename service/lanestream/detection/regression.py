@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lanestream.detection import Findings, Prepared
 from lanestream.detection.bars import BarSearch
 from lanestream.detection.edges import resized
-from lanestream.detection.refinement import Refinement
+from lanestream.detection.refinement import Fit, Refinement
 from lanestream.geometry import CanvasGeometry, RoadView, Scaling, visible_spans
 from lanestream.lanes import Candidate, Curve, Detection, FloatArray, Image
 
@@ -146,23 +146,31 @@ class RegressionDetector:
     def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
         """The boundaries in the network's outputs (2 N, 15), left to right, and the horizon that it saw."""
         reading, view = self.read(prepared, outputs)
-        curves = [reading.curve(side, view) for side in (0, 1)]
-        spans = visible_spans(curves, view, _TOP_SHARE)
-        seen = [
-            (side, Candidate(curve, *span, 1.0))
-            for side, (curve, span) in enumerate(zip(curves, spans, strict=True))
-            if reading.presence[side] >= self.threshold and span is not None
-        ]
-        sides = [side for side, _ in seen]
-        doubts = np.maximum(self.doubt * view.width * reading.deviations[sides], _EXACT * view.depth)
-        fits, view = self.refinement.refine(prepared.image, [candidate for _, candidate in seen], view, doubts)
-        spans = visible_spans([fit.curve for fit in fits], view, _TOP_SHARE)
+        fits, view = self.fitted(prepared.image, reading, view)
+        spans = visible_spans([fit.curve for fit in fits.values()], view, _TOP_SHARE)
         detections = [
             Detection(fit.curve, fit.covariance, *span, float(reading.presence[side]))
-            for side, fit, span in zip(sides, fits, spans, strict=True)
+            for (side, fit), span in zip(fits.items(), spans, strict=True)
             if span is not None
         ]
         return Findings(tuple(detections), view, float(reading.presence.max()))
+
+    def fitted(self, image: Image, reading: RoadReading, view: RoadView) -> tuple[dict[int, Fit], RoadView]:
+        """What is there of a `reading` of a BGR image, by side (0 left, 1 right), moved onto the paint beneath it.
+
+        `view` is the view with the network's horizon; the one that is returned has the fits'.
+        """
+        curves = [reading.curve(side, view) for side in (0, 1)]
+        spans = visible_spans(curves, view, _TOP_SHARE)
+        there = {
+            side: Candidate(curve, *span, 1.0)
+            for side, (curve, span) in enumerate(zip(curves, spans, strict=True))
+            if reading.presence[side] >= self.threshold and span is not None
+        }
+        deviations = reading.deviations[list(there)]
+        doubts = np.maximum(self.doubt * view.width * deviations, _EXACT * view.depth)
+        fits, view = self.refinement.refine(image, list(there.values()), view, doubts)
+        return dict(zip(there, fits, strict=True)), view
 
 
 def _anchor_rows(view: RoadView) -> FloatArray:
