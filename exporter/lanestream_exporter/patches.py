@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.candidates import CandidateSearch
+from lanestream.detection import answered
+from lanestream.detection.candidates import CandidateSearch, Proposals
+from lanestream.detection.prior import RoadGlance
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import RoadView, visible_rows
 from lanestream.lanes import Candidate, Curve, FloatArray, Image
@@ -96,15 +98,22 @@ def fitted_candidate(lane: LabelledLane, view: RoadView) -> Candidate | None:
 
 @dataclass(frozen=True)
 class PatchMaker:
-    """Frames to patches and their labels."""
+    """Frames to patches and their labels; candidates are proposed with a `glance` at the frame, where there is one."""
 
     search: CandidateSearch = CandidateSearch()
     cutter: StripCutter = StripCutter()
     rule: TruthRule = TruthRule()
+    glance: RoadGlance | None = None
 
-    def proposed(self, image: Image, frame: LabelledFrame) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    def propose(self, image: Image) -> Proposals:
+        """The candidates of a BGR image (H, W, 3) of which nothing is known."""
+        prior = None if self.glance is None else answered(self.glance.look(image))
+        return self.search.propose(image, prior=prior)
+
+    def proposed(
+        self, image: Image, frame: LabelledFrame, proposals: Proposals
+    ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
         """Patches (N, size, size, 3) of the frame's own candidates, and what each is (N,)."""
-        proposals = self.search.propose(image)
         verdicts = self.rule.judge(proposals.candidates, frame, proposals.view)
         return self.cutter.cut(image, proposals.candidates, proposals.view), verdicts
 
@@ -124,7 +133,8 @@ class PatchMaker:
         self, image: Image, frame: LabelledFrame, view: RoadView, rng: np.random.Generator
     ) -> Iterator[tuple[NDArray[np.uint8], int]]:
         """Trainable patches of a frame one by one: proposed and jittered ones that are clearly true or false."""
-        for patches, verdicts in (self.proposed(image, frame), self.jittered(image, frame, view, rng)):
+        proposed = self.proposed(image, frame, self.propose(image))
+        for patches, verdicts in (proposed, self.jittered(image, frame, view, rng)):
             for patch, verdict in zip(patches, verdicts, strict=True):
                 if verdict in (FALSE, TRUE):
                     yield patch, int(verdict)

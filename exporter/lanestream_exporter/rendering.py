@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,9 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.candidates import CandidateSearch
+from lanestream.detection.prior import RoadGlance
 from lanestream.detection.strips import StripCutter
+from lanestream.engine import load_engine
+from lanestream.errors import ModelError
 from lanestream.geometry import RoadView, StripGeometry
 from lanestream.lanes import Image
+from lanestream.runtime import RuntimeOptions
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.patches import PatchMaker
 from lanestream_exporter.patchstore import write_store
@@ -31,37 +36,62 @@ _SHARES = (0.4, 0.2, 0.25, 0.15)
 
 @dataclass(frozen=True)
 class PatchStores:
-    """Files in `folder` with patches of `size` x `size` pixels; those already there are kept."""
+    """Files in `folder` with patches of `size` x `size` pixels; those already there are kept.
+
+    Candidates are proposed as with the regressor at `guide`, an ONNX file, where there is one, else without.
+    """
 
     folder: Path
     size: int
+    guide: Path | None = None
 
     def rendered(self, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
         """Files of patches, the n-th from `scenes[n]` scenes and seeded by n.
 
         `done` is called with the number of scenes of each file as it is finished.
         """
-        write = partial(_render_file, self.size)
-        return scene_files(self.folder, f"rendered-{self.size}", scenes, write, workers, done)
+        write = partial(_render_file, self.size, self.guide)
+        return scene_files(self.folder, f"rendered-{self._kind}", scenes, write, workers, done)
 
     def labelled(self, name: str, frames: Callable[[], Frames], to_train: bool) -> Path:
         """One file of patches, told by its `name`, from labelled frames and their BGR pictures.
 
         Frames give their own candidates; those to train on also candidates beside their labels, a few times.
         """
-        path = self.folder / f"{name}-{self.size}.npz"
+        path = self.folder / f"{name}-{self._kind}.npz"
         if not path.exists():
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_store(path, _labelled_patches(self.size, frames(), to_train))
+            # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
+            search = CandidateSearch(limit=32) if to_train else CandidateSearch()
+            maker = PatchMaker(search, StripCutter(StripGeometry(self.size)), glance=_glance(self.guide))
+            write_store(path, _labelled_patches(maker, frames(), to_train))
         return path
 
+    @property
+    def _kind(self) -> str:
+        """What files of these patches are told by: another guide's are others. Raises ModelError without its file."""
+        if self.guide is None:
+            return f"{self.size}"
+        if not self.guide.is_file():
+            raise ModelError(f"can't read {self.guide}: no such file", "give a regressor's ONNX file as the guide")
+        return f"{self.size}-guided-{hashlib.sha256(self.guide.read_bytes()).hexdigest()[:8]}"
 
-def _render_file(size: int, number: int, scenes: int, path: Path) -> None:
-    write_store(path, _rendered_patches(size, number, scenes))
+
+def _glance(guide: Path | None) -> RoadGlance | None:
+    if guide is None:
+        return None
+    glance = load_engine(guide, "cpu", None, RuntimeOptions(threads=1)).pipeline().first_look
+    if glance is None:
+        raise ModelError(f"{guide} is not a regressor", "give a regressor's ONNX file as the guide")
+    return glance
 
 
-def _rendered_patches(size: int, number: int, scenes: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
-    maker = PatchMaker(cutter=StripCutter(StripGeometry(size)))
+def _render_file(size: int, guide: Path | None, number: int, scenes: int, path: Path) -> None:
+    maker = PatchMaker(cutter=StripCutter(StripGeometry(size)), glance=_glance(guide))
+    write_store(path, _rendered_patches(maker, number, scenes))
+
+
+def _rendered_patches(maker: PatchMaker, number: int, scenes: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
     for index in range(scenes):
         rng = np.random.default_rng([number, index])
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
@@ -70,14 +100,11 @@ def _rendered_patches(size: int, number: int, scenes: int) -> Iterator[tuple[NDA
         yield from maker.all_of(still.image, still.labels, view, rng)
 
 
-def _labelled_patches(size: int, frames: Frames, to_train: bool) -> Iterator[tuple[NDArray[np.uint8], int]]:
-    # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
-    search = CandidateSearch(limit=32) if to_train else CandidateSearch()
-    maker = PatchMaker(search, StripCutter(StripGeometry(size)))
+def _labelled_patches(maker: PatchMaker, frames: Frames, to_train: bool) -> Iterator[tuple[NDArray[np.uint8], int]]:
     clear = partial(filter, lambda item: item[1] in (0, 1))
     for number, (frame, image) in enumerate(frames):
         rng = np.random.default_rng([number, 1])
-        proposals = maker.search.propose(image)
-        yield from clear(zip(*maker.proposed(image, frame), strict=True))
+        proposals = maker.propose(image)
+        yield from clear(zip(*maker.proposed(image, frame, proposals), strict=True))
         for _ in range(_ROUNDS if to_train else 0):
             yield from clear(zip(*maker.jittered(image, frame, proposals.view, rng), strict=True))

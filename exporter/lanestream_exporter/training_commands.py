@@ -48,8 +48,9 @@ def classifier(config: Path, folder: Path, data: Path | None, patches: Path | No
     """
     settings = read_config(config, ClassifierConfig)
     network = starting_network(settings)  # what is no checkpoint is told now, not after the patches have been made
+    guide = settings.data.guide
     with _bar("rendering") as advance:
-        stores = PatchStores(patches or folder / "patches", settings.network.size)
+        stores = PatchStores(patches or folder / "patches", settings.network.size, Path(guide) if guide else None)
         files = patch_files(settings.data, stores, data, advance)
     sources = [part.read() for part in files]
     for source in sources:

@@ -139,6 +139,16 @@ class PatchData(Section):
         return max(self.real_share, self.final_real_share) > 0.0
 
 
+class ClassifierData(PatchData):
+    """Where a classifier's patches come from.
+
+    `guide` is the ONNX file of a regressor: candidates are proposed as they are where both are served. Without it they
+    are proposed as they are without a regressor.
+    """
+
+    guide: str | None = None
+
+
 class Light(Section):
     """How often what happens to a picture's light and in the camera: shares of the pictures."""
 
@@ -170,7 +180,7 @@ class ClassifierConfig(TrainConfig):
 
     label_smoothing: Share = 0.05
     network: NetworkSize = NetworkSize()
-    data: PatchData = PatchData()
+    data: ClassifierData = ClassifierData()
     augmentation: Augmentation = Augmentation()
 
 
