@@ -45,14 +45,16 @@ MODELS := service/lanestream/models
 
 # Networks like the shipped ones, into out/: hours of a CPU's work, which goes on where it was stopped.
 models: $(DEV_READY)
-	$(BIN)/lanestream train classifier --run runs/classifier
-	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
+	mkdir -p out
 	$(BIN)/lanestream train regressor --run runs/regressor
 	$(BIN)/lanestream train regressor regressor-second --run runs/regressor-second
-	mkdir -p out
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx --precision fp32
 	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx
+	$(BIN)/lanestream train classifier --run runs/classifier
+	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
+	$(BIN)/lanestream train classifier classifier-third --run runs/classifier-third
+	$(BIN)/lanestream export runs/classifier-third/best.pt out/classifier.onnx --guide out/regressor.onnx
+	$(BIN)/lanestream export runs/classifier-third/best.pt out/classifier-fp32.onnx --precision fp32 \
+	  --guide out/regressor.onnx
 
 evaluate: $(DEV_READY)
 	$(BIN)/lanestream evaluate --split test --model $(MODELS)/classifier.onnx --model $(MODELS)/regressor.onnx \

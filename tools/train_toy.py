@@ -36,7 +36,9 @@ def main(folder: Path) -> None:
     config.write_text(recipe() + f'\n[[data.train]]\npath = "{folder / "learn"}"\n', encoding="utf-8")
     lanestream("data", "check", folder / "learn", "--against", folder / "test", "--sheet", folder / "sheet.jpg")
     lanestream("train", "classifier", config, "--run", run)
-    lanestream("export", run / "best.pt", model, "--precision", "fp32", "--scenes", "4", "--tolerance", "5")
+    lanestream(
+        "export", run / "best.pt", model, "--guide", "none", "--precision", "fp32", "--scenes", "4", "--tolerance", "5"
+    )
     report = folder / "evaluation.json"
     lanestream("evaluate", "--model", model, "--regressor", "none", "--data", folder / "test", "--json", report)
     answer = served(model, folder / "test" / "thursday" / "0000.jpg", folder / "service.log")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -10,16 +11,19 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from lanestream.engine import chosen_regressor
 from lanestream.errors import ExportError
 from lanestream.geometry import StripGeometry
 from lanestream_exporter.alexnet import FULL
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
+from lanestream_exporter.exporting.classifier import ClassifierSubject
 from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
 from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.normalisation import NORMALISATIONS
 from lanestream_exporter.exporting.proof import Measured
-from lanestream_exporter.exporting.subject import Precision
+from lanestream_exporter.exporting.subject import Precision, Subject
+from lanestream_exporter.guides import glance_of
 from lanestream_exporter.training.config import PatchData
 
 _STRIP = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
@@ -71,6 +75,10 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
     "--scenes", type=click.IntRange(4), default=FrameSource.rendered, show_default=True,
     help="Rendered scenes to calibrate with, and as many to prove the file with.",
 )  # fmt: skip
+@click.option(
+    "--guide", type=click.Path(path_type=Path), metavar="FILE",
+    help="Of a classifier: the regressor that it will be served with, or `none`  [default: the shipped one].",
+)  # fmt: skip
 @click.option("--name", help="What the model is called  [default: by its kind]")
 @click.option("--classes", callback=_classes, help="Of a torchvision AlexNet: its classes in order, say false,lane.")
 @click.option(
@@ -87,12 +95,23 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
     foreign = _foreign(given["classes"], given["strip"], given["normalisation"])
     # What is no checkpoint is told now, not after the frames have been made.
     subject, training = read_subject(checkpoint, foreign)
+    subject = _guided(subject, given["guide"])
     own = _own_frames(training)
     root = data_root(given["data"]) if given["data"] and own is None else None
     source = FrameSource(root, rendered=given["scenes"], own=own)
     energy = subject.rank_energy if given["rank_energy"] is None else given["rank_energy"]
     settings = ExportSettings(given["name"] or subject.name, energy, given["precision"], given["tolerance"])
     _tell(out, export_network(subject, out, settings, Provenance(training, source), click.echo), source)
+
+
+def _guided(subject: Subject, named: Path | None) -> Subject:
+    """A classifier as it is served, with the regressor that is `named`; a regressor as it is."""
+    if isinstance(subject, ClassifierSubject):
+        guide = chosen_regressor(named)
+        return subject if guide is None else replace(subject, glance=glance_of(guide))
+    if named is not None:
+        raise click.UsageError("a regressor has no guide: --guide is for classifiers")
+    return subject
 
 
 def _own_frames(training: dict[str, Any]) -> PatchData | None:

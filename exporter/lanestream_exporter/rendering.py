@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from lanestream.detection.candidates import CandidateSearch
 from lanestream.detection.prior import RoadGlance
 from lanestream.detection.strips import StripCutter
-from lanestream.engine import load_engine
-from lanestream.errors import ModelError
 from lanestream.geometry import RoadView, StripGeometry
 from lanestream.lanes import Image
-from lanestream.runtime import RuntimeOptions
 from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.guides import glance_of
 from lanestream_exporter.patches import PatchMaker
 from lanestream_exporter.patchstore import write_store
 from lanestream_exporter.scenefiles import scene_files
@@ -63,31 +61,25 @@ class PatchStores:
             self.folder.mkdir(parents=True, exist_ok=True)
             # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
             search = CandidateSearch(limit=32) if to_train else CandidateSearch()
-            maker = PatchMaker(search, StripCutter(StripGeometry(self.size)), glance=_glance(self.guide))
+            maker = PatchMaker(search, StripCutter(StripGeometry(self.size)), glance=_glanced(self.guide))
             write_store(path, _labelled_patches(maker, frames(), to_train))
         return path
 
     @property
     def _kind(self) -> str:
-        """What files of these patches are told by: another guide's are others. Raises ModelError without its file."""
+        """What files of these patches are told by: another guide's are others. Raises ModelError for a bad one."""
         if self.guide is None:
             return f"{self.size}"
-        if not self.guide.is_file():
-            raise ModelError(f"can't read {self.guide}: no such file", "give a regressor's ONNX file as the guide")
+        glance_of(self.guide)  # what is no guide is told now, not by another process in the middle of a file
         return f"{self.size}-guided-{hashlib.sha256(self.guide.read_bytes()).hexdigest()[:8]}"
 
 
-def _glance(guide: Path | None) -> RoadGlance | None:
-    if guide is None:
-        return None
-    glance = load_engine(guide, "cpu", None, RuntimeOptions(threads=1)).pipeline().first_look
-    if glance is None:
-        raise ModelError(f"{guide} is not a regressor", "give a regressor's ONNX file as the guide")
-    return glance
+def _glanced(guide: Path | None) -> RoadGlance | None:
+    return None if guide is None else glance_of(guide)
 
 
 def _render_file(size: int, guide: Path | None, number: int, scenes: int, path: Path) -> None:
-    maker = PatchMaker(cutter=StripCutter(StripGeometry(size)), glance=_glance(guide))
+    maker = PatchMaker(cutter=StripCutter(StripGeometry(size)), glance=_glanced(guide))
     write_store(path, _rendered_patches(maker, number, scenes))
 
 

@@ -6,16 +6,23 @@ from pathlib import Path
 
 import pytest
 import torch
+from click import UsageError
 from click.testing import CliRunner, Result
 
-from lanestream.errors import CheckpointError, ExportError
+from lanestream.detection import Prepared
+from lanestream.engine import SHIPPED_REGRESSOR
+from lanestream.errors import CheckpointError, ExportError, ModelError
 from lanestream.geometry import StripGeometry
 from lanestream_exporter import export_commands
-from lanestream_exporter.alexnet import AlexNet
+from lanestream_exporter.alexnet import AlexNet, Shape
 from lanestream_exporter.exporting.classifier import ClassifierSubject
 from lanestream_exporter.exporting.export import ExportReport
 from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.proof import Boundaries, Measured
+from lanestream_exporter.exporting.regressor import RegressorSubject
+from lanestream_exporter.regressor import LaneRegressor
+
+SMALL = Shape(64, 0.1, 16)
 
 
 def called(*arguments: str | Path) -> Result:
@@ -60,6 +67,30 @@ def test_what_is_no_checkpoint_is_told_before_any_work(tmp_path: Path) -> None:
     result = called(path, tmp_path / "out.onnx")
     assert isinstance(result.exception, CheckpointError)
     assert not result.output
+
+
+def test_a_classifier_is_proved_as_it_is_served() -> None:
+    frames = FrameSource(None, rendered=4)
+    subject = ClassifierSubject(AlexNet(shape=SMALL), strip=StripGeometry(SMALL.size))
+    served, shipped, alone = (
+        [bottoms(prepared) for prepared in export_commands._guided(subject, guide).check(frames).prepared]
+        for guide in (SHIPPED_REGRESSOR, None, Path("none"))
+    )
+    assert served == shipped
+    assert served != alone
+    assert alone == [bottoms(prepared) for prepared in subject.check(frames).prepared]
+
+
+def bottoms(prepared: Prepared) -> list[float]:
+    """Where the candidates cross the bottom row."""
+    return [round(float(candidate.curve.x(prepared.view.bottom)), 1) for candidate in prepared.candidates]
+
+
+def test_a_guide_is_for_classifiers(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"can't read .*gone\.onnx"):
+        export_commands._guided(ClassifierSubject(AlexNet(shape=SMALL)), tmp_path / "gone.onnx")
+    with pytest.raises(UsageError, match="a regressor has no guide"):
+        export_commands._guided(RegressorSubject(LaneRegressor(SMALL)), SHIPPED_REGRESSOR)
 
 
 def test_the_table_compares_size_accuracy_and_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from lanestream.errors import LabelError
-from lanestream_exporter.patchstore import write_store
+from lanestream.detection import answered
+from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
+from lanestream.errors import LabelError, ModelError
+from lanestream_exporter.patches import PatchMaker
+from lanestream_exporter.patchstore import read_stores, write_store
 from lanestream_exporter.rendering import PatchStores
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.training.config import Frames, PatchData
@@ -110,3 +113,31 @@ def test_the_first_interrupt_is_noted_and_the_second_ends() -> None:
     # In a process of its own: what other tests have loaded into this one may have ideas of its own about signals.
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "noted, ended, as before\n", "")
+
+
+def test_a_guide_proposes_candidates_as_they_are_served(tmp_path: Path) -> None:
+    engine = load_engine(provider="cpu")
+    still = render_still(sample_scene(np.random.default_rng(8), 640, 360))
+    served, guided, alone = (
+        [round(float(candidate.curve.x(300.0)), 1) for candidate in proposed.candidates]
+        for proposed in (
+            answered(engine.open_session().prepare(still.image)),
+            PatchMaker(glance=engine.pipeline().glance).propose(still.image),
+            PatchMaker().propose(still.image),
+        )
+    )
+    assert guided == served != alone
+    cut = [
+        PatchStores(tmp_path, 64, guide).labelled("real", lambda: [(still.labels, still.image)], to_train=False)
+        for guide in (SHIPPED_REGRESSOR, None)
+    ]
+    stores = [read_stores([path]) for path in cut]
+    assert 0 < len(stores[0]) <= len(served)
+    assert list(stores[0].labels) != list(stores[1].labels)
+
+
+def test_a_guide_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"can't read .*gone\.onnx: no such file"):
+        PatchStores(tmp_path, 64, tmp_path / "gone.onnx").labelled("real", list, to_train=False)
+    with pytest.raises(ModelError, match=r"classifier\.onnx is not a regressor"):
+        PatchStores(tmp_path, 64, SHIPPED_MODEL).labelled("real", list, to_train=False)

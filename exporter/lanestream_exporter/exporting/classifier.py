@@ -13,12 +13,14 @@ from sklearn.metrics import average_precision_score
 from torch import Tensor, nn
 
 from lanestream import __version__
-from lanestream.detection import Prepared
+from lanestream.detection import Prepared, answered
 from lanestream.detection.detector import TRUE_LANE, CandidateDetector
+from lanestream.detection.prior import RoadGlance
 from lanestream.detection.strips import StripCutter
 from lanestream.geometry import StripGeometry
 from lanestream.imaging import ImageLimits, decode
 from lanestream.inference import ClassifierInfo, StripInfo
+from lanestream.lanes import Image
 from lanestream_exporter.alexnet import FULL, AlexNet
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import in_batches, truncated
@@ -49,13 +51,17 @@ class ServedClassifier(nn.Module):
 
 @dataclass(frozen=True)
 class ClassifierSubject:
-    """A plain AlexNet with two `classes`, the lane second, and how its patches were cut and `normalised`."""
+    """A plain AlexNet with two `classes`, the lane second, and how its patches were cut and normalised.
+
+    It is calibrated and proved on candidates as they are proposed after a `glance`, where there is one.
+    """
 
     network: AlexNet
     classes: tuple[str, str] = ("false", "lane")
     strip: StripGeometry = StripGeometry(FULL.size)
     normalisation: str = "contrast"
     calibration: Calibration = Calibration()
+    glance: RoadGlance | None = None
 
     name = "lanestream-alexnet"
     input_name = "patches"
@@ -136,7 +142,11 @@ class ClassifierSubject:
         )
 
     def _prepared(self, source: FrameSource, part: Part) -> list[tuple[Prepared, LabelledJpeg]]:
-        return [(self.detector.prepare(decode(frame.jpeg, ImageLimits())), frame) for frame in source.jpegs(part)]
+        return [(self._prepare(decode(frame.jpeg, ImageLimits())), frame) for frame in source.jpegs(part)]
+
+    def _prepare(self, image: Image) -> Prepared:
+        prior = None if self.glance is None else answered(self.glance.look(image))
+        return replace(self.detector.prepare(image, prior=prior), prior=prior)
 
 
 def _clear(check: Check) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
