@@ -171,6 +171,17 @@ def test_a_glance_tells_its_boundaries_on_the_paint_too() -> None:
         assert np.abs(painted.x(rows) - curve.x(rows)).max() < 2.0
 
 
+def test_no_paint_is_looked_for_beneath_a_boundary_that_is_followed() -> None:
+    glance = RoadGlance(RegressionDetector(), Told(answer(), answer()))
+    followed = Curve(HORIZON, (LEFT.coefficients[0], LEFT.coefficients[1] + 0.03, LEFT.coefficients[2]))
+    prior = answered(glance.look(road(), HORIZON, (followed,)))
+    assert prior.left is not None
+    assert prior.right is not None
+    assert (prior.left.painted is None, prior.right.painted is None) == (True, False)
+    aside = Curve(HORIZON, (LEFT.coefficients[0], LEFT.coefficients[1] + 0.3, LEFT.coefficients[2]))
+    assert len(answered(glance.look(road(), HORIZON, (aside,))).painted) == 2
+
+
 def test_labels_tell_the_horizon_they_share() -> None:
     assert shared_horizon([points(LEFT), points(RIGHT)], HEIGHT, None) == pytest.approx(HORIZON, abs=1.0)
     assert shared_horizon([points(LEFT)], HEIGHT, None) is None

@@ -227,7 +227,7 @@ class Pipeline:
             horizon = (yield from self.first_look.look(image)).view.horizon
         if self.glance is None:
             return self.detector.prepare(image, horizon, expected)
-        looking = self.glance.look(image, horizon if glanced is None else glanced)
+        looking = self.glance.look(image, horizon if glanced is None else glanced, expected)
         prior, survey = yield from beside(looking, lambda: self.detector.survey(image, horizon))
         prepared = self.detector.prepare(image, horizon, expected, prior, survey)
         return replace(prepared, prior=prior)

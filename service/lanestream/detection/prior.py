@@ -28,6 +28,9 @@ _COMPARED: Final = np.array(ANCHORS[:2])
 # No line is told more exactly than this, in rows below the horizon.
 _EXACT: Final = 0.02
 
+# What is nearer than this to a boundary that is followed, across it, in rows below the horizon, is that boundary.
+_FOLLOWED: Final = 0.05
+
 # How many times likelier a line is a boundary where it is a whole lane beside the ego lane, and the share of that where
 # it is far from such places: the feet of walls and the edges of the pavement run there, and hardly a boundary.
 _REPEATED: Final = 1.5
@@ -105,12 +108,16 @@ class RoadGlance:
     detector: RegressionDetector
     network: Network
 
-    def look(self, image: Image, horizon: float | None = None) -> Steps[RoadPrior]:
-        """The prior for a BGR image (H, W, 3); `horizon` is about its row, where known."""
+    def look(self, image: Image, horizon: float | None = None, followed: Sequence[Curve] = ()) -> Steps[RoadPrior]:
+        """The prior for a BGR image (H, W, 3); `horizon` is about its row, where known.
+
+        Beneath boundaries that are `followed` already, curves in image pixels, no paint is looked for.
+        """
         reading, seen = yield from self._reading(image, horizon)
         if abs(reading.horizon) > _SECOND_LOOK:
             reading, seen = yield from self._reading(image, seen.horizon)
-        fits, _ = self.detector.fitted(image, reading, seen)
+        new = [side for side in (0, 1) if not _is_followed(reading.curve(side, seen), followed, seen)]
+        fits, _ = self.detector.fitted(image, reading, seen, new)
         left, right = (self._seen(reading, side, seen, fits.get(side)) for side in (0, 1))
         return RoadPrior(seen, left, right)
 
@@ -125,3 +132,11 @@ class RoadGlance:
     def _reading(self, image: Image, horizon: float | None) -> Steps[tuple[RoadReading, RoadView]]:
         prepared = self.detector.prepare(image, horizon)
         return self.detector.read(prepared, (yield Question(self.network, prepared.inputs)))
+
+
+def _is_followed(curve: Curve, followed: Sequence[Curve], view: RoadView) -> bool:
+    """Whether it runs where one of the `followed` curves does."""
+    below = _COMPARED * view.depth
+    rows = view.horizon + below
+    near = _FOLLOWED * below * np.hypot(1.0, curve.slope(rows))
+    return any(bool((np.abs(other.x(rows) - curve.x(rows)) < near).all()) for other in followed)

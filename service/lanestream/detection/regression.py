@@ -155,16 +155,18 @@ class RegressionDetector:
         ]
         return Findings(tuple(detections), view, float(reading.presence.max()))
 
-    def fitted(self, image: Image, reading: RoadReading, view: RoadView) -> tuple[dict[int, Fit], RoadView]:
+    def fitted(
+        self, image: Image, reading: RoadReading, view: RoadView, sides: Sequence[int] = (0, 1)
+    ) -> tuple[dict[int, Fit], RoadView]:
         """What is there of a `reading` of a BGR image, by side (0 left, 1 right), moved onto the paint beneath it.
 
-        `view` is the view with the network's horizon; the one that is returned has the fits'.
+        Of the `sides` alone. `view` is the view with the network's horizon; the one that is returned has the fits'.
         """
-        curves = [reading.curve(side, view) for side in (0, 1)]
-        spans = visible_spans(curves, view, _TOP_SHARE)
+        curves = [reading.curve(side, view) for side in sides]
+        spans = visible_spans(curves, view, _TOP_SHARE) if curves else []
         there = {
             side: Candidate(curve, *span, 1.0)
-            for side, (curve, span) in enumerate(zip(curves, spans, strict=True))
+            for side, curve, span in zip(sides, curves, spans, strict=True)
             if reading.presence[side] >= self.threshold and span is not None
         }
         deviations = reading.deviations[list(there)]
