@@ -2,7 +2,8 @@
 
 The strip along the candidate is searched for a narrow bright bar row by row, and the curve is pulled onto the bars by
 reweighted least squares. Where the paint is missing, or shows no bend, the candidate's own line is the prior, and so is
-the road that it shares with the others: a dashed marking keeps its direction, and far ends meet at one point.
+the road that it shares with the others: a dashed marking keeps its direction, and far ends meet at one point. A fit on
+one stripe of a double line is moved to between the two.
 """
 
 from __future__ import annotations
