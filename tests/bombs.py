@@ -16,7 +16,7 @@ from typing import Final
 import fakes
 
 from lanestream.errors import ImageError
-from lanestream.imaging import ImageLimits, decode
+from lanestream.images.decoding import ImageLimits, decode
 
 HUGE: Final = (20_000, 15_000)
 PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"

@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Findings, Pipeline, Prepared
+from lanestream.detection import Detections, Pipeline, Prepared
 from lanestream.engine import Engine
-from lanestream.geometry import RoadView, visible_rows
-from lanestream.lanes import Curve, Detection, Image
 from lanestream.protocol import EgoModel, LanesMessage, Limits, Mode, ReadyMessage, TimingModel
+from lanestream.road.curve import Curve
+from lanestream.road.results import Detection
+from lanestream.road.view import Image, RoadView, visible_rows
 
 WAIT_S = 10.0  # far more than anything takes; a test that hangs fails instead
 
@@ -40,7 +41,7 @@ class FakeDetector:
         view = RoadView(width, height, 0.4 * height if horizon is None else horizon)
         return Prepared(image, (lambda: np.zeros((2, 8, 8, 3), np.uint8),), view, (), 1.0)
 
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Detections:
         if prepared.image.min() == 255:
             raise RuntimeError("a detector's own mistake")
         found = []
@@ -50,7 +51,7 @@ class FakeDetector:
             if rows is None:
                 continue
             found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9))
-        return Findings(tuple(found), prepared.view, prepared.horizon_weight)
+        return Detections(tuple(found), prepared.view, prepared.horizon_weight)
 
 
 class LeftDetector(FakeDetector):

@@ -20,11 +20,13 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 import atheris
 
-with atheris.instrument_imports(include=["lanestream.image_files", "lanestream.imaging", "lanestream.protocol"]):
+with atheris.instrument_imports(
+    include=["lanestream.images.header", "lanestream.images.decoding", "lanestream.protocol"]
+):
     import bombs
 
     from lanestream.errors import ImageError, ProtocolError
-    from lanestream.imaging import ImageLimits, decode
+    from lanestream.images.decoding import ImageLimits, decode
     from lanestream.protocol import parse_client_message
 
 import cv2

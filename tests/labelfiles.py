@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 
 from lanestream.errors import LabelError
-from lanestream.lanes import Image
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.checking import Check
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.reading import read_dataset, survey

@@ -11,9 +11,9 @@ import click
 import numpy as np
 
 from lanestream.detection import answered
-from lanestream.detection.candidates import CandidateSearch
-from lanestream.detection.detector import CandidateDetector
-from lanestream.detection.prior import RoadGlance
+from lanestream.detection.candidate_detector import CandidateDetector
+from lanestream.detection.ego_prior import EgoPriorEstimator
+from lanestream.detection.proposals import CandidateSearch
 from lanestream.engine import load_engine
 from lanestream.errors import LanestreamError
 from lanestream_exporter.datasets.splits import Split, data_root, real_frames
@@ -25,7 +25,7 @@ _ALL = CandidateSearch(limit=MOST_CANDIDATES)
 _STRAIGHT = replace(_ALL, perspective=replace(_ALL.perspective, spread_bend=1e-9))
 
 
-def steps() -> Iterator[tuple[str, CandidateSearch, RoadGlance | None]]:
+def steps() -> Iterator[tuple[str, CandidateSearch, EgoPriorEstimator | None]]:
     """The steps, each with what those before it have."""
     yield "Hough edges", replace(_STRAIGHT, sources=("singles",)), None
     yield "and their pairs", replace(_STRAIGHT, sources=("singles", "pairs")), None

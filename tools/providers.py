@@ -21,7 +21,7 @@ from rich.table import Table
 
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
 from lanestream.errors import ProviderError
-from lanestream.inference import LoadedNetwork, load_network
+from lanestream.inference import LoadedModel, load_model
 from lanestream.runtime import PROVIDERS, RuntimeOptions
 from lanestream_exporter.scenes import render_still, sample_scene
 
@@ -70,18 +70,18 @@ def _inputs() -> Sequence[Inputs]:
     ]
 
 
-def _networks(path: Path, options: RuntimeOptions) -> Mapping[str, LoadedNetwork]:
+def _networks(path: Path, options: RuntimeOptions) -> Mapping[str, LoadedModel]:
     networks = {}
     for provider in PROVIDERS[1:]:
         try:
-            networks[provider] = load_network(path, provider, options)
+            networks[provider] = load_model(path, provider, options)
         except ProviderError:
             continue
         networks[provider].warm_up()
     return networks
 
 
-def _times(networks: Mapping[str, LoadedNetwork], inputs: Inputs, rounds: int) -> Mapping[tuple[str, int], float]:
+def _times(networks: Mapping[str, LoadedModel], inputs: Inputs, rounds: int) -> Mapping[tuple[str, int], float]:
     """Milliseconds an input by provider and batch size."""
     least: dict[tuple[str, int], float] = {}
     for batch in _BATCHES:

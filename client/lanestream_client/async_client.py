@@ -17,10 +17,10 @@ from websockets.exceptions import ConnectionClosed
 from lanestream.errors import LanestreamError
 from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage
 from lanestream_client import handshake, requests
-from lanestream_client.conversation import Conversation
+from lanestream_client.client_protocol import ClientProtocol
 from lanestream_client.endpoint import endpoints
+from lanestream_client.failover import PASSING, Patience, Route
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
-from lanestream_client.route import PASSING, Patience, Route
 from lanestream_client.service import ServiceInfo, as_frames
 
 _TIMEOUT_S: Final = 30.0
@@ -97,7 +97,7 @@ class AsyncLaneClient:
         source = frames if isinstance(frames, AsyncIterable) else _in_thread(frames)
         start = requests.start(mode, horizon, detector, camera, session)
         route = Route(self._replicas, self._patience, self._timeout)
-        return AsyncLaneStream(route, source, Conversation(start, in_flight=self._in_flight))
+        return AsyncLaneStream(route, source, ClientProtocol(start, in_flight=self._in_flight))
 
     async def _answer(self, ask: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
         """The good answer of the first replica that gives one. Raises the last one's error where none does."""
@@ -116,7 +116,7 @@ class AsyncLaneClient:
 class AsyncLaneStream:
     """The results of one stream: connects when iterated, which can be done once."""
 
-    def __init__(self, route: Route, frames: AsyncIterable[SourceFrame], conversation: Conversation) -> None:
+    def __init__(self, route: Route, frames: AsyncIterable[SourceFrame], conversation: ClientProtocol) -> None:
         self._route = route
         self._frames = frames
         self._conversation = conversation
@@ -189,7 +189,7 @@ async def _connected(route: Route, timeout: float) -> AsyncIterator[ClientConnec
 class _Exchange:
     """Where three tasks share one conversation: the source's and, for each socket, the sender's, and the caller's."""
 
-    def __init__(self, conversation: Conversation, frames: AsyncIterable[SourceFrame]) -> None:
+    def __init__(self, conversation: ClientProtocol, frames: AsyncIterable[SourceFrame]) -> None:
         self._conversation = conversation
         self._frames = frames
         self._changed = asyncio.Condition()

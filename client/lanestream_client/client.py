@@ -18,10 +18,10 @@ from websockets.sync.client import ClientConnection, connect
 from lanestream.errors import LanestreamError
 from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage
 from lanestream_client import handshake, requests
-from lanestream_client.conversation import Conversation
+from lanestream_client.client_protocol import ClientProtocol
 from lanestream_client.endpoint import endpoints
+from lanestream_client.failover import PASSING, Patience, Route
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
-from lanestream_client.route import PASSING, Patience, Route
 from lanestream_client.service import ServiceInfo, as_frames
 
 _TIMEOUT_S: Final = 30.0
@@ -102,7 +102,7 @@ class LaneClient:
         """
         start = requests.start(mode, horizon, detector, camera, session)
         route = Route(self._replicas, self._patience, self._timeout)
-        return LaneStream(route, as_frames(frames), Conversation(start, in_flight=self._in_flight))
+        return LaneStream(route, as_frames(frames), ClientProtocol(start, in_flight=self._in_flight))
 
     def _answer(self, ask: Callable[[str], httpx.Response]) -> httpx.Response:
         """The good answer of the first replica that gives one. Raises the last one's error where none does."""
@@ -121,7 +121,7 @@ class LaneClient:
 class LaneStream:
     """The results of one stream: connects when iterated, which can be done once."""
 
-    def __init__(self, route: Route, frames: Iterator[SourceFrame], conversation: Conversation) -> None:
+    def __init__(self, route: Route, frames: Iterator[SourceFrame], conversation: ClientProtocol) -> None:
         self._route = route
         self._frames = frames
         self._conversation = conversation
@@ -189,7 +189,7 @@ def _connected(route: Route, timeout: float) -> Iterator[ClientConnection]:
 class _Exchange:
     """Where three threads share one conversation: the source's and, for each socket, the sender's, and the caller's."""
 
-    def __init__(self, conversation: Conversation, frames: Iterator[SourceFrame]) -> None:
+    def __init__(self, conversation: ClientProtocol, frames: Iterator[SourceFrame]) -> None:
         self._conversation = conversation
         self._frames = frames
         self._changed = threading.Condition()

@@ -20,12 +20,12 @@ from lanestream.errors import ImageError, LanestreamError, LostError, SourceErro
 from lanestream.protocol import camera_of
 from lanestream.runtime import PROVIDERS
 from lanestream_client.client import LaneClient
+from lanestream_client.failover import Patience
 from lanestream_client.frames import SourceFrame
 from lanestream_client.in_process import InProcess, LocalEngine
 from lanestream_client.live import NewestFrames
 from lanestream_client.report import Tally
 from lanestream_client.requests import image_bytes
-from lanestream_client.route import Patience
 from lanestream_client.service import ServiceInfo
 from lanestream_client.sinks import json_lines, video_sink
 from lanestream_client.sources import image_files, open_source

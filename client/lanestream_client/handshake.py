@@ -63,7 +63,7 @@ def options(endpoint: Endpoint, timeout: float) -> dict[str, Any]:
 
 @contextmanager
 def telling(endpoint: Endpoint) -> Iterator[None]:
-    """Turns the failures of a socket in the block into the errors that a user can read."""
+    """Admission the failures of a socket in the block into the errors that a user can read."""
     try:
         yield
     except ConnectionClosed as error:

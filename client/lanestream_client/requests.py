@@ -88,7 +88,7 @@ def refused(status: int, body: bytes | bytearray, place: str) -> LanestreamError
 
 @contextmanager
 def reaching(place: str) -> Iterator[None]:
-    """Turns the transport's failures into ConnectionFailedError."""
+    """Admission the transport's failures into ConnectionFailedError."""
     try:
         yield
     except httpx.HTTPError as error:

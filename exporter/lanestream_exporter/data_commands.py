@@ -10,10 +10,10 @@ from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.checking import Check
+from lanestream_exporter.datasets.contact_sheet import ContactSheet
 from lanestream_exporter.datasets.folder import DataFolder
 from lanestream_exporter.datasets.formats import FORMATS
 from lanestream_exporter.datasets.reading import form_of, survey
-from lanestream_exporter.datasets.sheet import ContactSheet
 
 _FORM = click.option("--format", "form", type=click.Choice(["auto", *FORMATS]), default="auto", show_default=True)
 

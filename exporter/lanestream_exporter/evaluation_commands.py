@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Final
 import click
 from rich.console import Console
 
-from lanestream.engine import SHIPPED_MODEL, chosen_regressor, load_engine
+from lanestream.engine import SHIPPED_MODEL, load_engine, resolve_regressor
 from lanestream.errors import LabelError, ModelError, SourceError, needs_extra
 from lanestream_exporter.datasets.folder import DataFolder
 from lanestream_exporter.datasets.formats import FORMATS
 from lanestream_exporter.datasets.reading import form_of, read_dataset
 from lanestream_exporter.datasets.splits import data_root
+from lanestream_exporter.evaluation.baselines import HoughLinesPeer, SlidingWindowPeer
 from lanestream_exporter.evaluation.measuring import Material
 from lanestream_exporter.evaluation.measuring import evaluate as measure
 from lanestream_exporter.evaluation.methods import Method, Model, Peer
-from lanestream_exporter.evaluation.peers import HoughLinesPeer, SlidingWindowPeer
 from lanestream_exporter.evaluation.score import score as measured
 from lanestream_exporter.evaluation.tables import tables
 
@@ -113,7 +113,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _methods(models: Sequence[Path], regressor: Path | None) -> list[Method]:
-    guide = chosen_regressor(regressor)
+    guide = resolve_regressor(regressor)
     ours = [Model(load_engine(path, "cpu", guide)) for path in models]
     methods: list[Method] = [*ours, Peer(HoughLinesPeer()), Peer(SlidingWindowPeer())]
     names = [method.name for method in methods]

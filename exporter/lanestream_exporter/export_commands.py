@@ -11,9 +11,9 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from lanestream.engine import chosen_regressor
+from lanestream.detection.patches import PatchGeometry
+from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
-from lanestream.geometry import StripGeometry
 from lanestream_exporter.alexnet import FULL
 from lanestream_exporter.datasets.splits import data_root
 from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
@@ -23,7 +23,7 @@ from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.normalisation import NORMALISATIONS
 from lanestream_exporter.exporting.proof import Measured
 from lanestream_exporter.exporting.subject import Precision, Subject
-from lanestream_exporter.guides import glance_of
+from lanestream_exporter.samples.prior_regressor import prior_estimator
 from lanestream_exporter.training.config import PatchData
 
 _STRIP = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
@@ -33,7 +33,7 @@ def _classes(_context: click.Context, _option: click.Parameter, value: str | Non
     return None if value is None else tuple(name.strip() for name in value.split(","))
 
 
-def _strip(_context: click.Context, _option: click.Parameter, value: str | None) -> StripGeometry | None:
+def _strip(_context: click.Context, _option: click.Parameter, value: str | None) -> PatchGeometry | None:
     """The strip geometry in `size=224,half_width=0.5,min_half_width=5`; what isn't named has its usual value."""
     if value is None:
         return None
@@ -48,7 +48,7 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
             raise click.BadParameter(f"{key} must be a number, not {number!r}") from None
         if not (0 < given[key] < math.inf or (key == "lean" and given[key] == 0)):
             raise click.BadParameter(f"{key} must be above 0")
-    return StripGeometry(**given)
+    return PatchGeometry(**given)
 
 
 @click.command()
@@ -107,8 +107,8 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
 def _guided(subject: Subject, named: Path | None) -> Subject:
     """A classifier as it is served, with the regressor that is `named`; a regressor as it is."""
     if isinstance(subject, ClassifierSubject):
-        guide = chosen_regressor(named)
-        return subject if guide is None else replace(subject, glance=glance_of(guide))
+        guide = resolve_regressor(named)
+        return subject if guide is None else replace(subject, glance=prior_estimator(guide))
     if named is not None:
         raise click.UsageError("a regressor has no guide: --guide is for classifiers")
     return subject
@@ -123,7 +123,7 @@ def _own_frames(training: dict[str, Any]) -> PatchData | None:
     return PatchData.model_validate({key: data[key] for key in ("train", "validation", "validation_share")})
 
 
-def _foreign(classes: tuple[str, ...] | None, strip: StripGeometry | None, normalisation: str) -> Foreign | None:
+def _foreign(classes: tuple[str, ...] | None, strip: PatchGeometry | None, normalisation: str) -> Foreign | None:
     if classes is None and strip is None:
         return None
     if classes is None or strip is None:

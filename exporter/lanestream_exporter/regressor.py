@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from lanestream.detection.regression import ANCHORS
+from lanestream.detection.regression_detector import ANCHORS
 from lanestream_exporter.alexnet import FULL, AlexNet, Shape
-from lanestream_exporter.canvases import SHARES
+from lanestream_exporter.samples.road_crops import SHARES
 
 # Standard deviations are told as logarithms in image widths, within what pixels and roads allow.
 _LEAST_LOG, _MOST_LOG = -7.5, 0.0
@@ -95,7 +95,7 @@ class Answer:
         return cls(raw[:, :6].view(-1, 2, 3) + usual, logs, raw[:, 12:14], raw[:, 14])
 
     def told(self) -> Tensor:
-        """What is served (N, 15): the layout of `lanestream.detection.regression.RoadReading`."""
+        """What is served (N, 15): the layout of `lanestream.detection.regression_detector.RegressorOutput`."""
         return torch.cat(
             [
                 self.columns.flatten(1),

@@ -11,7 +11,7 @@ from types import FrameType
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from lanestream_exporter.rendering import PatchStores
+from lanestream_exporter.samples.patch_files import PatchStores
 from lanestream_exporter.training.classifier import ClassifierTask, starting_network
 from lanestream_exporter.training.config import SHIPPED, ClassifierConfig, TrainConfig, read_config
 from lanestream_exporter.training.device import best_device, described

@@ -117,14 +117,14 @@ def serve(*, print_config: bool, **given: Any) -> None:
     with needs_extra("service,cpu"):
         # The image module comes first, because OpenCV reads its limit once.
         from lanestream.api.server import serve as run
-        from lanestream.engine import chosen_regressor, load_engine
+        from lanestream.engine import load_engine, resolve_regressor
         from lanestream.settings import load_settings, shown
         from lanestream_client.overlays import draw_lanes
     settings = load_settings(**given)
     if print_config:
         click.echo(shown(settings))
         return
-    regressor = chosen_regressor(settings.regressor)
+    regressor = resolve_regressor(settings.regressor)
     load = partial(load_engine, settings.model, settings.provider, regressor, settings.runtime_options)
     run(settings, load, draw_lanes)
 

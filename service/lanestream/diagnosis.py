@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from lanestream import __version__, machine
-from lanestream.engine import SHIPPED_MODEL, chosen_regressor
+from lanestream.engine import SHIPPED_MODEL, resolve_regressor
 from lanestream.errors import LanestreamError
-from lanestream.inference import LoadedNetwork, RegressorInfo, load_network
+from lanestream.inference import LoadedModel, RegressorInfo, load_model
 from lanestream.inference.providers import NAMES, offered
 from lanestream.runtime import Provider
 from lanestream.settings import Settings
@@ -87,14 +87,14 @@ def diagnose(settings: Settings, required: Provider | None = None) -> Diagnosis:
 def _networks(settings: Settings, provider: Provider) -> Iterator[NetworkReport]:
     network, report = _examined(settings.model or SHIPPED_MODEL, provider, settings)
     yield report
-    regressor = chosen_regressor(settings.regressor)
+    regressor = resolve_regressor(settings.regressor)
     if regressor is not None and not isinstance(network.info, RegressorInfo):
         yield _examined(regressor, provider, settings)[1]
 
 
-def _examined(path: Path, provider: Provider, settings: Settings) -> tuple[LoadedNetwork, NetworkReport]:
+def _examined(path: Path, provider: Provider, settings: Settings) -> tuple[LoadedModel, NetworkReport]:
     started = time.perf_counter()
-    network = load_network(path, provider, settings.runtime_options)
+    network = load_model(path, provider, settings.runtime_options)
     loaded = time.perf_counter()
     network.warm_up()
     warm = time.perf_counter()
@@ -117,7 +117,7 @@ def _examined(path: Path, provider: Provider, settings: Settings) -> tuple[Loade
     return network, report
 
 
-def _median_ms(network: LoadedNetwork, batch: int) -> float:
+def _median_ms(network: LoadedModel, batch: int) -> float:
     inputs = network.blank(batch)
     taken = []
     for _ in range(_ROUNDS):

@@ -8,19 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from lanestream.detection import LaneDetector, Network, Pipeline, chosen, in_one
-from lanestream.detection.detector import CandidateDetector
-from lanestream.detection.prior import RoadGlance
-from lanestream.detection.regression import RegressionDetector
-from lanestream.detection.strips import StripCutter
+from lanestream.detection import Detector, Network, Pipeline, chosen, in_one
+from lanestream.detection.candidate_detector import CandidateDetector
+from lanestream.detection.ego_prior import EgoPriorEstimator
+from lanestream.detection.patches import PatchCutter, PatchGeometry
+from lanestream.detection.regression_detector import RegressionDetector, RoadCropGeometry
 from lanestream.errors import ModelError
-from lanestream.geometry import CanvasGeometry, StripGeometry
-from lanestream.inference import ClassifierInfo, LoadedNetwork, RegressorInfo, load_network
-from lanestream.lanes import FrameResult, Image
+from lanestream.inference import ClassifierInfo, LoadedModel, RegressorInfo, load_model
 from lanestream.protocol import DetectorName
+from lanestream.road.results import FrameResult
+from lanestream.road.view import Image
 from lanestream.runtime import DEFAULT_OPTIONS, Provider, RuntimeOptions
-from lanestream.sessions import Session
-from lanestream.sessions.walk import FrameWalk
+from lanestream.session import Session
+from lanestream.workers.walk import FrameWalk
 
 # The networks that are shipped, and served where no others are named.
 SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
@@ -34,7 +34,7 @@ class Engine:
         self.pipelines = tuple(pipelines)
 
     @property
-    def detector(self) -> LaneDetector:
+    def detector(self) -> Detector:
         """The default detector."""
         return self.pipelines[0].detector
 
@@ -88,7 +88,7 @@ def load_engine(
     if not isinstance(other.info, RegressorInfo):
         raise ModelError(f"{regressor} is a {other.info.kind}, not a regressor", "give a regressor, or `none`")
     regression = _regression(other.info)
-    glance = RoadGlance(regression, other)
+    glance = EgoPriorEstimator(regression, other)
     return Engine(
         [
             Pipeline("candidates", _candidates(network.info), network, glance),
@@ -97,32 +97,32 @@ def load_engine(
     )
 
 
-def chosen_regressor(named: Path | None) -> Path | None:
+def resolve_regressor(named: Path | None) -> Path | None:
     """The file that users mean by `named`: the default one where they name none, and no file by the name `none`."""
     if named is None:
         return SHIPPED_REGRESSOR
     return None if named == Path("none") else named
 
 
-def _warm(path: Path, provider: Provider, options: RuntimeOptions) -> LoadedNetwork:
-    network = load_network(path, provider, options)
+def _warm(path: Path, provider: Provider, options: RuntimeOptions) -> LoadedModel:
+    network = load_model(path, provider, options)
     network.warm_up()
     return network
 
 
 def _whole_frames(detector: RegressionDetector, network: Network) -> Pipeline:
     """The detector that needs one look; a frame whose horizon it does not know it looks at once more, closely."""
-    return Pipeline("regression", detector, network, first_look=RoadGlance(detector, network))
+    return Pipeline("regression", detector, network, first_look=EgoPriorEstimator(detector, network))
 
 
 def _candidates(info: ClassifierInfo) -> CandidateDetector:
     """The detector that asks a classifier about the strips it was trained on."""
-    strip = StripGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width, info.strip.lean)
-    return CandidateDetector(info.threshold, cutter=StripCutter(strip))
+    strip = PatchGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width, info.strip.lean)
+    return CandidateDetector(info.threshold, cutter=PatchCutter(strip))
 
 
 def _regression(info: RegressorInfo) -> RegressionDetector:
     """The detector that shows a regressor the canvases it was trained on."""
     canvas = info.canvas
-    geometry = CanvasGeometry(canvas.size, canvas.above, canvas.narrowest)
+    geometry = RoadCropGeometry(canvas.size, canvas.above, canvas.narrowest)
     return RegressionDetector(info.threshold, geometry, canvas.detail_width)

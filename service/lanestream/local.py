@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from lanestream.detection.edges import WORKING_WIDTH
-from lanestream.engine import chosen_regressor, load_engine
-from lanestream.imaging import MOST_PIXELS, ImageLimits, Picture, decode_reduced
+from lanestream.detection.features import WORKING_WIDTH
+from lanestream.engine import load_engine, resolve_regressor
+from lanestream.images.decoding import MOST_PIXELS, ImageLimits, Picture, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
 
 if TYPE_CHECKING:
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
     from lanestream.detection import Network
     from lanestream.engine import Engine
-    from lanestream.lanes import Image
     from lanestream.protocol import CameraModel, DetectorName, LanesMessage
+    from lanestream.road.view import Image
     from lanestream.runtime import Provider
-    from lanestream.sessions import Session
+    from lanestream.session import Session
 
 # Who decodes a file of their own may give it more memory than a service gives to strangers.
 _LIMITS: Final = ImageLimits(max_bytes=1 << 28, max_pixels=MOST_PIXELS)
@@ -36,7 +36,7 @@ class LocalEngine:
 
         The path `none` goes without a regressor. Raises ModelError and ProviderError.
         """
-        return cls(load_engine(model, provider, chosen_regressor(regressor)))
+        return cls(load_engine(model, provider, resolve_regressor(regressor)))
 
     def network(self, detector: DetectorName | None = None) -> Network:
         """The network of a detector, of the default one where None. Raises NoDetectorError where it is not loaded."""

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from lanestream.geometry import Camera, Scaling
-from lanestream.lanes import curve_columns
 from lanestream.protocol import (
     CameraModel,
     EgoModel,
@@ -21,12 +19,16 @@ from lanestream.protocol import (
     Point,
     TimingModel,
 )
+from lanestream.road.camera import Camera
+from lanestream.road.curve import curve_columns
+from lanestream.road.view import Scaling
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lanestream.imaging import Picture
-    from lanestream.lanes import EgoLane, FloatArray, FrameResult, LaneBoundary
+    from lanestream.images.decoding import Picture
+    from lanestream.road.curve import FloatArray
+    from lanestream.road.results import EgoLane, FrameResult, LaneBoundary
 
 _POINTS: Final = 24
 # Decimals that keep a curve exact to a hundredth of a pixel over the tallest image that is accepted.

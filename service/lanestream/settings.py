@@ -22,12 +22,12 @@ from pydantic_settings import (
 )
 
 from lanestream.errors import SettingsError
-from lanestream.imaging import MOST_PIXELS, ImageLimits
+from lanestream.images.decoding import MOST_PIXELS, ImageLimits
 from lanestream.keys import ApiKey, parse_keys
 from lanestream.processors import network_threads, processors
 from lanestream.runtime import Provider, RuntimeOptions
-from lanestream.sessions.manager import SessionLimits
-from lanestream.sessions.stream_rules import StreamLimits
+from lanestream.streaming.session_registry import SessionLimits
+from lanestream.streaming.stream_protocol import StreamLimits
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails

@@ -20,7 +20,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from lanestream.api import create_app
-from lanestream.api.access import Gatekeeper, warn_if_open
+from lanestream.api.auth import Authenticator, warn_if_open
 from lanestream.errors import SettingsError
 from lanestream.keys import ApiKey, new_key
 from lanestream.settings import Settings
@@ -337,7 +337,7 @@ def test_a_service_for_everybody_says_so_loudly() -> None:
 def test_a_service_with_keys_or_for_this_machine_alone_does_not(
     caplog: pytest.LogCaptureFixture, keys: tuple[ApiKey, ...], loopback: bool
 ) -> None:
-    warn_if_open(Gatekeeper(keys), "a host", loopback=loopback)
+    warn_if_open(Authenticator(keys), "a host", loopback=loopback)
     assert not caplog.records
-    warn_if_open(Gatekeeper(), "a host", loopback=False)
+    warn_if_open(Authenticator(), "a host", loopback=False)
     assert len(caplog.records) == 1

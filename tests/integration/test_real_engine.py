@@ -13,10 +13,10 @@ import onnx
 import pytest
 from processes import service
 
-from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, Engine, chosen_regressor, load_engine
+from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, Engine, load_engine, resolve_regressor
 from lanestream.errors import ModelError, NoDetectorError
-from lanestream.imaging import ImageLimits, decode
-from lanestream.inference import CanvasInfo, RegressorInfo
+from lanestream.images.decoding import ImageLimits, decode
+from lanestream.inference import RegressorInfo, RoadCropInfo
 from lanestream.inference.model_info import METADATA_KEY
 from lanestream.local import LocalEngine
 from lanestream.protocol import DetectorName, LanesMessage
@@ -67,7 +67,7 @@ def regressor(tmp_path_factory: pytest.TempPathFactory) -> Path:
         training={},
         metrics={},
         exporter="",
-        canvas=CanvasInfo(size=size, above=0.1, narrowest=0.5, detail_width=64),
+        canvas=RoadCropInfo(size=size, above=0.1, narrowest=0.5, detail_width=64),
     )
     helper.set_model_props(model, {METADATA_KEY: info.model_dump_json()})
     path = tmp_path_factory.mktemp("models") / "steadfast.onnx"
@@ -171,8 +171,8 @@ def test_a_model_may_go_without_a_regressor(drive: list[bytes], regressor: Path)
         local.detect(drive[0], detector="regression")
     with pytest.raises(ModelError, match=r"is a classifier, not a regressor \(give a regressor, or `none`\)"):
         LocalEngine.load(None, "cpu", SHIPPED_MODEL)
-    assert (chosen_regressor(None), chosen_regressor(Path("none"))) == (SHIPPED_REGRESSOR, None)
-    assert chosen_regressor(regressor) == regressor
+    assert (resolve_regressor(None), resolve_regressor(Path("none"))) == (SHIPPED_REGRESSOR, None)
+    assert resolve_regressor(regressor) == regressor
 
 
 def test_times_that_jump_break_nothing(real_url: str, drive: list[bytes]) -> None:

@@ -30,10 +30,10 @@ from lanestream.errors import (
 from lanestream_client import AsyncLaneClient, LaneClient, SourceFrame, StreamResult
 from lanestream_client.async_client import AsyncLaneStream
 from lanestream_client.client import LaneStream
-from lanestream_client.conversation import Conversation
+from lanestream_client.client_protocol import ClientProtocol
 from lanestream_client.endpoint import endpoints
+from lanestream_client.failover import Patience, Route
 from lanestream_client.requests import start
-from lanestream_client.route import Patience, Route
 
 KEY = "hidden-key"
 
@@ -271,7 +271,7 @@ def test_a_replica_that_does_not_even_refuse_is_passed_over(awaits: bool) -> Non
     ):
         mute = f"http://127.0.0.1:{silent.getsockname()[1]}"
         way = Route(endpoints([one.url, mute, other.url]), Patience(attempt_s=0.1), 10.0)
-        conversation = Conversation(start("all", None, None, None, None))
+        conversation = ClientProtocol(start("all", None, None, None, None))
         if awaits:
             results = asyncio.run(collected(AsyncLaneStream(way, as_they_come(frames(3)), conversation)))
         else:

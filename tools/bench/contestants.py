@@ -18,7 +18,7 @@ from demo import LANESTREAM, free_port, stop
 
 from bench.orders import Kind
 from bench.plan import LITSERVE, NAIVE, SERVICE
-from lanestream.detection.candidates import CandidateSearch
+from lanestream.detection.proposals import CandidateSearch
 from lanestream.runtime import Provider
 
 READY_S: Final = 120.0

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from bench.plan import Size
-from lanestream.lanes import Image
+from lanestream.road.view import Image
 from lanestream_client.sources import open_source
 from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 

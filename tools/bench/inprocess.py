@@ -19,17 +19,17 @@ from bench.frames import FPS, Clips, to_and_fro
 from bench.orders import Answer, Kind, Order, Tally
 from lanestream.detection import in_one
 from lanestream.engine import Engine, load_engine
-from lanestream.imaging import ImageLimits, decode
+from lanestream.images.decoding import ImageLimits, decode
 from lanestream.local import LocalCamera, LocalEngine
 from lanestream.logs import log_config
 from lanestream.runtime import Provider
-from lanestream.sessions.offers import Offers
-from lanestream.sessions.parcels import Setup
-from lanestream.sessions.process_runner import ProcessRunner, usual_processes
-from lanestream.sessions.runner import FrameRunner
-from lanestream.sessions.thread_runner import ThreadRunner
-from lanestream.sessions.worker import EncodedFrame
 from lanestream.settings import load_settings
+from lanestream.workers.capabilities import Capabilities
+from lanestream.workers.frame_worker import EncodedFrame
+from lanestream.workers.ipc import Setup
+from lanestream.workers.pool import WorkerPool
+from lanestream.workers.process_pool import ProcessPool, usual_processes
+from lanestream.workers.thread_pool import ThreadPool
 
 
 @dataclass(frozen=True)
@@ -53,15 +53,15 @@ def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
     cv2.setNumThreads(settings.opencv_threads)
     load = partial(load_engine, provider=provider, options=settings.runtime_options)
     engine = load()
-    processes = settings.processes or usual_processes(Offers.of(engine.pipelines))
+    processes = settings.processes or usual_processes(Capabilities.of(engine.pipelines))
     threads = processes * settings.threads_of(processes)
     network = engine.network
     patches = patches_per_frame(engine, clips[max(clips)])
     with ThreadPoolExecutor(1) as worker, asyncio.Runner() as loop:
         setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
-        runners: dict[Kind, FrameRunner] = {
-            "pipeline": ThreadRunner(engine, settings.image_limits, threads),
-            "pool": worker.submit(loop.run, ProcessRunner.started(setup, processes, settings.threads_of)).result(),
+        runners: dict[Kind, WorkerPool] = {
+            "pipeline": ThreadPool(engine, settings.image_limits, threads),
+            "pool": worker.submit(loop.run, ProcessPool.started(setup, processes, settings.threads_of)).result(),
         }
         pipe.send(Hello(processes, threads // processes, network.name, network.provider, patches))
         while True:
@@ -120,7 +120,7 @@ class Cameras:
         with ThreadPoolExecutor(threads) as workers:
             list(workers.map(self._loop, [cameras[thread::threads] for thread in range(min(threads, len(cameras)))]))
 
-    async def run(self, runner: FrameRunner) -> None:
+    async def run(self, runner: WorkerPool) -> None:
         """As a service runs it: its threads or processes and its batches, nothing of the network."""
         cameras = [asyncio.create_task(self._follow(runner, number)) for number in range(self.order.sessions)]
         stopped = asyncio.create_task(asyncio.to_thread(self.stopped.wait))
@@ -131,7 +131,7 @@ class Cameras:
         self.stopped.set()
         await asyncio.gather(*done)
 
-    async def _follow(self, runner: FrameRunner, number: int) -> None:
+    async def _follow(self, runner: WorkerPool, number: int) -> None:
         camera, seq = runner.open_camera(detector=self.order.detector), 0
         while True:
             started = time.monotonic()

@@ -11,11 +11,11 @@ import litserve
 import numpy as np
 
 from lanestream.detection import Question, Steps, in_one
-from lanestream.detection.edges import WORKING_WIDTH
+from lanestream.detection.features import WORKING_WIDTH
 from lanestream.engine import load_engine
-from lanestream.imaging import ImageLimits, Picture, decode_reduced
-from lanestream.lanes import FrameResult
+from lanestream.images.decoding import ImageLimits, Picture, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
+from lanestream.road.results import FrameResult
 from lanestream.runtime import Provider
 
 # LitServe's documentation takes batches of 8 and waits 50 to 100 ms for them; a tenth of that is kinder to few clients.

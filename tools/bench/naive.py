@@ -20,9 +20,9 @@ from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from lanestream.detection.edges import WORKING_WIDTH, find_edges
+from lanestream.detection.features import WORKING_WIDTH, find_edges
 from lanestream.detection.hough import ExtendedHough
-from lanestream.lanes import Image
+from lanestream.road.view import Image
 from lanestream_exporter.alexnet import FULL, AlexNet
 
 HORIZON = 0.45  # a constant of one camera, as a share of the height

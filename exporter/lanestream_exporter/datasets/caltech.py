@@ -17,7 +17,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from lanestream.errors import LabelError
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.entries import Entries, Entry
 from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
 from lanestream_exporter.datasets.labels import LabelledLane

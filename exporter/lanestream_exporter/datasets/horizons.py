@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
 
 # How far a frame's horizon is usually from its drive's, as a share of the height: cameras nod, and roads rise and fall.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
 from lanestream.errors import ImageError, LabelError
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.entries import Entries, Entry
 from lanestream_exporter.datasets.folder import IMAGE_FOLDERS, DataFolder, drive_of
 from lanestream_exporter.datasets.labels import LabelledLane

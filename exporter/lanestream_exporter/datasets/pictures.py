@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final, Self
 
 from lanestream.errors import ImageError, SourceError
-from lanestream.image_files import Header, read_header
-from lanestream.imaging import MOST_PIXELS, ImageLimits, decode
-from lanestream.lanes import Image
+from lanestream.images.decoding import MOST_PIXELS, ImageLimits, decode
+from lanestream.images.header import Header, read_header
+from lanestream.road.view import Image
 
 import cv2  # isort: skip  (imaging sets OpenCV's own limit before it is imported)
 import numpy as np  # isort: skip

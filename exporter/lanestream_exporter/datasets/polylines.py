@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.geometry import RoadView
-from lanestream.lanes import Curve, FloatArray, curve_basis
+from lanestream.road.curve import Curve, FloatArray, curve_basis
+from lanestream.road.view import RoadView
 
 # A hand that places points may slip by this much, in pixels, beyond the picture's edge or back down the boundary.
 SLACK: Final = 1.0

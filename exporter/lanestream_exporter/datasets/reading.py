@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lanestream.errors import LabelError, LanestreamError
-from lanestream.lanes import Image
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.entries import Entry
 from lanestream_exporter.datasets.folder import DataFolder
 from lanestream_exporter.datasets.formats import FORMATS, detect

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from lanestream.errors import LabelError
-from lanestream.lanes import Image
-from lanestream_exporter.datasets.between import Between
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.clips import read_clip, read_clip_labels
+from lanestream_exporter.datasets.label_propagation import Between
 from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, Coverage, LabelledFrame
 from lanestream_exporter.datasets.records import records
 from lanestream_exporter.datasets.tusimple import read_tusimple

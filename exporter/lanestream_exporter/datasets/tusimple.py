@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from lanestream.errors import LabelError
-from lanestream.lanes import Image
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.entries import Entries, Entry, numbered
 from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
 
 # Sums of per-frame counts (R, C) to figures, each (R,); a figure is not a number where nothing was counted.

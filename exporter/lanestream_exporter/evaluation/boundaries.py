@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lanestream.lanes import Curve, FloatArray, LaneBoundary
+from lanestream.road.curve import Curve, FloatArray
+from lanestream.road.results import LaneBoundary
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
-from lanestream_exporter.patches import columns_at
+from lanestream_exporter.samples.patches import columns_at
 
 _MEAN, _MEDIAN, _OVERLAP = 15.0, 20.0, 0.5
 _BOTTOM = 0.9722  # the row, as a share of the height, at which sides are told: row 700 of 720

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
 from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, RULES, JudgedCandidates, Outcome
-from lanestream_exporter.patches import FALSE, TRUE, UNKNOWN, UNSURE
+from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE
 
 _BINS = 10
 # Whose word is measured: the classifier's own, or what the detector decides by.

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lanestream.lanes import FloatArray, Image
+from lanestream.road.curve import FloatArray
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import Found
 from lanestream_exporter.evaluation.reported import reported_columns

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation import culane, tusimple
 from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from lanestream.lanes import FloatArray, Image
+from lanestream.road.curve import FloatArray
+from lanestream.road.view import Image
 from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.figures import match_all
 from lanestream_exporter.evaluation.measuring import Material

@@ -14,13 +14,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.horizons import shared_horizon
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
 from lanestream_exporter.evaluation.boundaries import ego_sides
 from lanestream_exporter.evaluation.outcomes import Outcome
-from lanestream_exporter.patches import columns_at
+from lanestream_exporter.samples.patches import columns_at
 
 METRES: Final = (10.0, 30.0)
 _HEIGHT: Final = 1.45

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from lanestream.errors import LabelError, SourceError
-from lanestream.lanes import Image
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import LabelledClip, Split, labelled_clips, real_frames

@@ -7,9 +7,10 @@ from dataclasses import replace
 from typing import Protocol
 
 from lanestream.detection import answered
-from lanestream.detection.detector import CandidateDetector
+from lanestream.detection.candidate_detector import CandidateDetector
 from lanestream.engine import Engine
-from lanestream.lanes import FrameResult, Image
+from lanestream.road.results import FrameResult
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import Found
 from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, Outcome, judge

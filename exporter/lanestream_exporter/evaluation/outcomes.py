@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection import Prepared
-from lanestream.detection.detector import TRUE_LANE, CandidateDetector
+from lanestream.detection.candidate_detector import TRUE_LANE, CandidateDetector
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import Found, ego_sides
-from lanestream_exporter.patches import TruthRule, distance_along
+from lanestream_exporter.samples.patches import TruthRule, distance_along
 
 MOST_CANDIDATES = 32
 

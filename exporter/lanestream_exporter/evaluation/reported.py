@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import Found
 

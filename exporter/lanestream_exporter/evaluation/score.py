@@ -8,8 +8,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from lanestream.errors import SourceError
-from lanestream.lanes import Curve
 from lanestream.protocol import LaneModel, LanesMessage
+from lanestream.road.curve import Curve
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.evaluation.boundaries import Found, match_ego
 from lanestream_exporter.evaluation.outcomes import Outcome
 

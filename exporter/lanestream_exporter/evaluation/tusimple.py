@@ -13,11 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import Found
 from lanestream_exporter.evaluation.reported import reported_columns
-from lanestream_exporter.patches import columns_at
+from lanestream_exporter.samples.patches import columns_at
 
 SIZE: Final = (1280, 720)
 ROWS: Final = np.arange(240.0, 711.0, 10.0)

@@ -11,8 +11,8 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
+from lanestream.detection.patches import PatchGeometry
 from lanestream.errors import CheckpointError
-from lanestream.geometry import StripGeometry
 from lanestream_exporter.alexnet import FULL, AlexNet, Shape, load_state
 from lanestream_exporter.exporting.classifier import ClassifierSubject
 from lanestream_exporter.exporting.regressor import RegressorSubject
@@ -32,7 +32,7 @@ class Foreign:
     """What a checkpoint from elsewhere doesn't say: its `classes` in order, its strips, its pixels' normalisation."""
 
     classes: tuple[str, ...]
-    strip: StripGeometry
+    strip: PatchGeometry
     normalisation: str = "imagenet"
 
 
@@ -63,7 +63,7 @@ def _own(path: Path, state: Mapping[str, Any]) -> Subject:
         regressor = LaneRegressor(shape, normalised=_has_norms(weights))
         _load(path, regressor, weights)
         return RegressorSubject(regressor.eval().folded())
-    return ClassifierSubject(_alexnet(path, weights, shape), strip=StripGeometry(shape.size))
+    return ClassifierSubject(_alexnet(path, weights, shape), strip=PatchGeometry(shape.size))
 
 
 def _recorded_shape(path: Path, state: Mapping[str, Any]) -> Shape:

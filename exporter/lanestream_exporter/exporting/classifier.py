@@ -14,13 +14,12 @@ from torch import Tensor, nn
 
 from lanestream import __version__
 from lanestream.detection import Prepared, answered
-from lanestream.detection.detector import TRUE_LANE, CandidateDetector
-from lanestream.detection.prior import RoadGlance
-from lanestream.detection.strips import StripCutter
-from lanestream.geometry import StripGeometry
-from lanestream.imaging import ImageLimits, decode
-from lanestream.inference import ClassifierInfo, StripInfo
-from lanestream.lanes import Image
+from lanestream.detection.candidate_detector import TRUE_LANE, CandidateDetector
+from lanestream.detection.ego_prior import EgoPriorEstimator
+from lanestream.detection.patches import PatchCutter, PatchGeometry
+from lanestream.images.decoding import ImageLimits, decode
+from lanestream.inference import ClassifierInfo, PatchInfo
+from lanestream.road.view import Image
 from lanestream_exporter.alexnet import FULL, AlexNet
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import in_batches, truncated
@@ -28,7 +27,7 @@ from lanestream_exporter.exporting.frames import FrameSource, LabelledJpeg, Part
 from lanestream_exporter.exporting.normalisation import NORMALISATIONS
 from lanestream_exporter.exporting.subject import Check, Description, Figures
 from lanestream_exporter.exporting.versions import exporter
-from lanestream_exporter.patches import FALSE, TRUE, TruthRule
+from lanestream_exporter.samples.patches import FALSE, TRUE, TruthRule
 
 _MOST_RANGING: Final = 1024
 
@@ -58,10 +57,10 @@ class ClassifierSubject:
 
     network: AlexNet
     classes: tuple[str, str] = ("false", "lane")
-    strip: StripGeometry = StripGeometry(FULL.size)
+    strip: PatchGeometry = PatchGeometry(FULL.size)
     normalisation: str = "contrast"
     calibration: Calibration = Calibration()
-    glance: RoadGlance | None = None
+    glance: EgoPriorEstimator | None = None
 
     name = "lanestream-alexnet"
     input_name = "patches"
@@ -73,7 +72,7 @@ class ClassifierSubject:
     @property
     def detector(self) -> CandidateDetector:
         """The detector that will ask the file."""
-        return CandidateDetector(self.calibration.threshold, cutter=StripCutter(self.strip))
+        return CandidateDetector(self.calibration.threshold, cutter=PatchCutter(self.strip))
 
     def ranging(self, source: FrameSource) -> NDArray[np.uint8]:
         """Patches (N, size, size, 3) of candidates of training frames. Raises LabelError."""
@@ -121,7 +120,7 @@ class ClassifierSubject:
 
     def info(self, description: Description) -> ClassifierInfo:
         """What the file says of itself."""
-        strip = StripInfo(
+        strip = PatchInfo(
             size=self.strip.size,
             half_width=self.strip.half_width,
             min_half_width=self.strip.min_half_width,

@@ -10,10 +10,10 @@ from typing import Final, Literal, TypeVar
 import cv2
 import numpy as np
 
-from lanestream.lanes import Image
+from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import real_frames
-from lanestream_exporter.roadframes import RoadFrame, road_frames
+from lanestream_exporter.samples.road_frames import RoadFrame, road_frames
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.training.config import PatchData
 from lanestream_exporter.training.ownframes import own_frames

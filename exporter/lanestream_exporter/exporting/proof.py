@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import LaneDetector
-from lanestream.inference import OnnxModel, load_network
+from lanestream.detection import Detector
+from lanestream.inference import OnnxModel, load_model
 from lanestream.inference.providers import offered, without_gpus
-from lanestream.lanes import Detection
+from lanestream.road.results import Detection
 from lanestream.runtime import RuntimeOptions
 from lanestream_exporter.exporting.subject import Check, Figures
 
@@ -75,7 +75,7 @@ def differences(
 
 
 def boundaries(
-    detector: LaneDetector, check: Check, expected: NDArray[np.float32], outputs: NDArray[np.float32]
+    detector: Detector, check: Check, expected: NDArray[np.float32], outputs: NDArray[np.float32]
 ) -> Boundaries:
     """What two networks' outputs for the frames of `check` make of them, compared."""
     gaps: list[NDArray[np.float64]] = []
@@ -119,7 +119,7 @@ def timed(paths: Mapping[str, Path], inputs: NDArray[np.uint8]) -> Times:
     """
     batch = np.resize(inputs[: BATCHES[-1]], (BATCHES[-1], *inputs.shape[1:]))
     options, offer = RuntimeOptions(threads=1), without_gpus(offered())
-    models = {name: load_network(path, "auto", options, offer) for name, path in paths.items()}
+    models = {name: load_model(path, "auto", options, offer) for name, path in paths.items()}
     taken: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(_ROUNDS + 2):
         for name, model in models.items():

@@ -1,4 +1,4 @@
-"""Exporting the regressor: canonical pictures in, what `detection.regression.RoadReading` reads out."""
+"""Exporting the regressor: canonical pictures in, what `detection.regression.RegressorOutput` reads out."""
 
 from __future__ import annotations
 
@@ -14,12 +14,10 @@ from scipy.special import logit
 from torch import Tensor, nn
 
 from lanestream import __version__
-from lanestream.detection.regression import RegressionDetector
-from lanestream.geometry import CanvasGeometry
-from lanestream.imaging import ImageLimits, decode
-from lanestream.inference import CanvasInfo, RegressorInfo
-from lanestream.lanes import FloatArray
-from lanestream_exporter.canvases import SHARES, Warp, plain_warp, sample
+from lanestream.detection.regression_detector import RegressionDetector, RoadCropGeometry
+from lanestream.images.decoding import ImageLimits, decode
+from lanestream.inference import RegressorInfo, RoadCropInfo
+from lanestream.road.curve import FloatArray
 from lanestream_exporter.exporting.calibration import Calibration, calibrated
 from lanestream_exporter.exporting.compression import in_batches, truncated
 from lanestream_exporter.exporting.frames import FrameSource
@@ -27,7 +25,8 @@ from lanestream_exporter.exporting.normalisation import contrast
 from lanestream_exporter.exporting.subject import Check, Description, Figures
 from lanestream_exporter.exporting.versions import exporter
 from lanestream_exporter.regressor import Answer, LaneRegressor
-from lanestream_exporter.roadframes import RoadFrame
+from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.samples.road_frames import RoadFrame
 
 _MOST_RANGING: Final = 1024
 _WARPS: Final = 5
@@ -41,7 +40,7 @@ _RIGHT: Final = 5.0
 
 
 class ServedRegressor(nn.Module):
-    """The graph: uint8 RGB canvases (N, H, W, 3) in, the layout of `RoadReading` (N, 15) out."""
+    """The graph: uint8 RGB canvases (N, H, W, 3) in, the layout of `RegressorOutput` (N, 15) out."""
 
     def __init__(self, network: LaneRegressor, temperature: float, half: bool = False) -> None:
         super().__init__()
@@ -73,7 +72,7 @@ class RegressorSubject:
     @property
     def detector(self) -> RegressionDetector:
         """The detector that will ask the file."""
-        return RegressionDetector(self.calibration.threshold, CanvasGeometry(self.network.size.size))
+        return RegressionDetector(self.calibration.threshold, RoadCropGeometry(self.network.size.size))
 
     def ranging(self, source: FrameSource) -> NDArray[np.uint8]:
         """Canvases (N, size, size, 3) of training frames, as they are and as other cameras would see them."""
@@ -139,7 +138,7 @@ class RegressorSubject:
     def info(self, description: Description) -> RegressorInfo:
         """What the file says of itself."""
         detector = self.detector
-        canvas = CanvasInfo(
+        canvas = RoadCropInfo(
             size=detector.geometry.size,
             above=detector.geometry.above,
             narrowest=detector.geometry.narrowest,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from lanestream.detection import LaneDetector, Prepared
+from lanestream.detection import Detector, Prepared
 from lanestream.inference import ModelInfo
 from lanestream_exporter.exporting.calibration import Calibration
 from lanestream_exporter.exporting.frames import FrameSource
@@ -84,7 +84,7 @@ class Subject(Protocol):
         """The temperature and the threshold."""
 
     @property
-    def detector(self) -> LaneDetector:
+    def detector(self) -> Detector:
         """The detector that will ask the file."""
 
     def ranging(self, source: FrameSource) -> NDArray[np.uint8]:

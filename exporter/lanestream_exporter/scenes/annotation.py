@@ -10,7 +10,7 @@ from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLa
 
 if TYPE_CHECKING:
     from lanestream_exporter.scenes.camera import FloatArray
-    from lanestream_exporter.scenes.canvas import Image
+    from lanestream_exporter.scenes.render_target import Image
     from lanestream_exporter.scenes.scene import Scene
     from lanestream_exporter.scenes.view import RoadView
 

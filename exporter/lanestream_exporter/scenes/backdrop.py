@@ -11,7 +11,7 @@ import numpy as np
 from lanestream_exporter.scenes.noise import TILE, noise_tiles
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.canvas import Canvas
+    from lanestream_exporter.scenes.render_target import Canvas
     from lanestream_exporter.scenes.surface import Colour
     from lanestream_exporter.scenes.view import Layer
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lanestream_exporter.scenes.dice import Dice
 from lanestream_exporter.scenes.lens import Lens
 from lanestream_exporter.scenes.light import Air
+from lanestream_exporter.scenes.random_sampler import RandomSampler
 from lanestream_exporter.scenes.render import RenderedFrame, render_still
 from lanestream_exporter.scenes.road import Pose
 from lanestream_exporter.scenes.sampling import STYLES, Weather, compose_scene, sample_weather
@@ -107,7 +107,7 @@ def sample_clip(
     rng: np.random.Generator, width: int, height: int, frames: int, fps: float, drive: Drive | None = None
 ) -> Clip:
     """A random clip of `frames` pictures of the given size in pixels; without a `drive`, of any kind."""
-    dice = Dice(rng)
+    dice = RandomSampler(rng)
     drive = drive or Drive(dice.weighed(STYLES), lane_change=dice.chance(0.3))
     weather = Weather(night=False, dull=False, wet=False, fog=math.inf) if drive.fair else sample_weather(dice)
     motion = Motion(
@@ -130,7 +130,7 @@ def sample_clip(
     return replace(clip, scene=replace(scene, traffic=_out_of_the_way(clip)))
 
 
-def _lane_change(dice: Dice, scene: Scene, duration: float) -> LaneChange | None:
+def _lane_change(dice: RandomSampler, scene: Scene, duration: float) -> LaneChange | None:
     """A change to a neighbouring lane of our direction, in the middle of the clip."""
     shifts = [lane for lane in scene.road.lanes if 1.0 < abs(lane - scene.pose.u) < 4.5]
     if not shifts:

@@ -9,8 +9,8 @@ from lanestream_exporter.scenes.road import Marking
 from lanestream_exporter.scenes.surface import Colour, Joint, Material, Patch, Seam, Surface, Track
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.dice import Dice
     from lanestream_exporter.scenes.layout import Layout
+    from lanestream_exporter.scenes.random_sampler import RandomSampler
 
 VERGES: dict[str, Colour] = {
     "grass": (0.16, 0.38, 0.29),
@@ -23,13 +23,13 @@ VERGES: dict[str, Colour] = {
 WORDS = ("SLOW", "STOP", "BUS", "ONLY", "50", "30", "SCHOOL", "XING", "^", "^", "<", ">")
 
 
-def grey(dice: Dice, tone: float) -> Colour:
+def grey(dice: RandomSampler, tone: float) -> Colour:
     """A grey of this brightness with a slight cast."""
     warm = dice.around(0.025)
     return (tone * (1.0 - warm), tone * (1.0 + dice.around(0.01)), tone * (1.0 + warm))
 
 
-def sample_surface(dice: Dice, layout: Layout) -> Surface:
+def sample_surface(dice: RandomSampler, layout: Layout) -> Surface:
     """A ground for the road: materials, wear and flaws."""
     clean = dice.between(0.4, 1.3)
     asphalt = not layout.concrete
@@ -48,7 +48,7 @@ def sample_surface(dice: Dice, layout: Layout) -> Surface:
     )
 
 
-def _materials(dice: Dice, layout: Layout) -> tuple[Material, ...]:
+def _materials(dice: RandomSampler, layout: Layout) -> tuple[Material, ...]:
     right, left = layout.paved
     verges = [dice.pick(list(VERGES)) for _ in range(2)]
     if dice.chance(0.6):
@@ -75,14 +75,14 @@ def _materials(dice: Dice, layout: Layout) -> tuple[Material, ...]:
     return tuple(parts)
 
 
-def _other_tone(dice: Dice, layout: Layout) -> float:
+def _other_tone(dice: RandomSampler, layout: Layout) -> float:
     """The brightness of pavement laid at another time or of another kind."""
     if layout.concrete and dice.chance(0.7):
         return dice.between(0.2, 0.4)
     return min(0.65, max(0.16, layout.tone * dice.between(0.65, 1.4)))
 
 
-def _lanes(dice: Dice, layout: Layout) -> list[Material]:
+def _lanes(dice: RandomSampler, layout: Layout) -> list[Material]:
     """Lanes of one tone, or of several where lanes were laid or resurfaced one by one."""
     base, uneven = grey(dice, layout.tone), dice.chance(0.35)
     parts = []
@@ -96,7 +96,7 @@ def _lanes(dice: Dice, layout: Layout) -> list[Material]:
     return parts
 
 
-def _tracks(dice: Dice, layout: Layout) -> tuple[Track, ...]:
+def _tracks(dice: RandomSampler, layout: Layout) -> tuple[Track, ...]:
     """Two wheel tracks and an oil stripe in every lane."""
     wheels = dice.between(-0.08, 0.16)
     oil = dice.between(-0.04, 0.22) if dice.chance(0.6) else 0.0
@@ -110,7 +110,7 @@ def _tracks(dice: Dice, layout: Layout) -> tuple[Track, ...]:
     return tuple(tracks)
 
 
-def _seams(dice: Dice, layout: Layout) -> tuple[Seam, ...]:
+def _seams(dice: RandomSampler, layout: Layout) -> tuple[Seam, ...]:
     """Lines along the road that a detector must learn to leave alone."""
     seams: list[Seam] = []
     spots = [boundary.u + dice.pick((-1.0, 1.0)) * dice.between(0.12, 0.45) for boundary in layout.boundaries]
@@ -135,7 +135,7 @@ def _seams(dice: Dice, layout: Layout) -> tuple[Seam, ...]:
     return tuple(seams)
 
 
-def _joints(dice: Dice, layout: Layout) -> tuple[Joint, ...]:
+def _joints(dice: RandomSampler, layout: Layout) -> tuple[Joint, ...]:
     right, left = layout.paved
     if layout.concrete:
         return (Joint(right, left, dice.between(4.0, 6.5), dice.between(0.01, 0.03), dice.between(0.25, 0.7)),)
@@ -144,7 +144,7 @@ def _joints(dice: Dice, layout: Layout) -> tuple[Joint, ...]:
     return ()
 
 
-def sample_patches(dice: Dice, layout: Layout, length: float) -> tuple[Patch, ...]:
+def sample_patches(dice: RandomSampler, layout: Layout, length: float) -> tuple[Patch, ...]:
     """Repairs, and now and then a whole stretch of other pavement, on `length` metres of road."""
     right, left = layout.paved
     patches = []
@@ -160,7 +160,7 @@ def sample_patches(dice: Dice, layout: Layout, length: float) -> tuple[Patch, ..
     return tuple(patches)
 
 
-def sample_paintwork(dice: Dice, layout: Layout, length: float) -> Paintwork:
+def sample_paintwork(dice: RandomSampler, layout: Layout, length: float) -> Paintwork:
     """Ghosts, words, arrows and bars on `length` metres of road."""
     ghosts = []
     if dice.chance(0.22):
@@ -175,7 +175,7 @@ def sample_paintwork(dice: Dice, layout: Layout, length: float) -> Paintwork:
     return Paintwork(tuple(ghosts), tuple(stencils), tuple(bars))
 
 
-def _ghost(dice: Dice, layout: Layout) -> Ghost:
+def _ghost(dice: RandomSampler, layout: Layout) -> Ghost:
     """An old line at a clear distance from the present ones: beside them it would be no mistake to find it."""
     spot = dice.pick(layout.ahead) + dice.around(0.25) * layout.lane_width
     marking = Marking(
@@ -193,7 +193,7 @@ def _ghost(dice: Dice, layout: Layout) -> Ghost:
     return Ghost(spot, marking, dice.between(0.0, 0.4), dice.between(60.0, 200.0), min(0.75, layout.tone * gain))
 
 
-def _stencil(dice: Dice, layout: Layout, length: float) -> Stencil:
+def _stencil(dice: RandomSampler, layout: Layout, length: float) -> Stencil:
     return Stencil(
         text=dice.pick(WORDS),
         s=dice.between(25.0, length),
@@ -206,7 +206,7 @@ def _stencil(dice: Dice, layout: Layout, length: float) -> Stencil:
     )
 
 
-def _bars(dice: Dice, layout: Layout, length: float) -> Bars:
+def _bars(dice: RandomSampler, layout: Layout, length: float) -> Bars:
     right, left = layout.paved
     crossing = dice.chance(0.6)
     pitch = dice.between(0.8, 1.3)

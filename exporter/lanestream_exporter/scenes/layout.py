@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from lanestream_exporter.scenes.road import Boundary, Marking, MarkingKind, PaintColour, Stripe
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.dice import Dice
+    from lanestream_exporter.scenes.random_sampler import RandomSampler
 
 Style = Literal["highway", "country", "street", "lane"]
 
@@ -73,7 +73,7 @@ class Layout:
 class _Painter:
     """Makes the markings of one road, which share their paint, age and dash pattern."""
 
-    dice: Dice
+    dice: RandomSampler
     tone: float
     period: float
     dash: float
@@ -83,7 +83,7 @@ class _Painter:
     width: float
 
     @classmethod
-    def of(cls, dice: Dice, tone: float) -> _Painter:
+    def of(cls, dice: RandomSampler, tone: float) -> _Painter:
         """A painter for a road whose surface has this brightness."""
         period, dash = dice.pick(DASHES)
         faint = dice.chance(0.4)  # old paint on pale concrete is only a little lighter than the road
@@ -128,18 +128,18 @@ class _Painter:
         )
 
 
-def sample_layout(dice: Dice, style: Style) -> Layout:
+def sample_layout(dice: RandomSampler, style: Style) -> Layout:
     """A cross-section of the given style; one in eight for driving on the left."""
     maker = {"highway": _highway, "country": _country, "street": _street, "lane": _bare_lane}[style]
     layout = maker(dice)
     return layout.mirrored() if dice.chance(0.12) else layout
 
 
-def _tone(dice: Dice, *, concrete: bool) -> float:
+def _tone(dice: RandomSampler, *, concrete: bool) -> float:
     return dice.between(0.42, 0.64) if concrete else dice.between(0.22, 0.5)
 
 
-def _highway(dice: Dice) -> Layout:
+def _highway(dice: RandomSampler) -> Layout:
     lanes, width = dice.weighed({2: 0.3, 3: 0.3, 4: 0.27, 5: 0.13}), dice.between(3.35, 3.9)
     ego = dice.whole(0, lanes - 1)
     concrete = dice.chance(0.45)
@@ -164,7 +164,7 @@ def _highway(dice: Dice) -> Layout:
     return Layout("highway", tuple(boundaries), ahead, (), width, paved, concrete, tone, float(dice.chance(0.7)))
 
 
-def _country(dice: Dice) -> Layout:
+def _country(dice: RandomSampler) -> Layout:
     width = dice.between(2.8, 3.7)
     tone = _tone(dice, concrete=False)
     paint = _Painter.of(dice, tone)
@@ -186,7 +186,7 @@ def _country(dice: Dice) -> Layout:
     return Layout("country", boundaries, (0.0,), (width,), width, paved, False, tone)
 
 
-def _street(dice: Dice) -> Layout:
+def _street(dice: RandomSampler) -> Layout:
     """A street between kerbs; where its sides carry no paint they carry no label either."""
     width, lanes = dice.between(2.8, 3.5), dice.whole(1, 3)
     towards = dice.pick((0, 1, 1, 2))
@@ -214,7 +214,7 @@ def _street(dice: Dice) -> Layout:
     return Layout("street", tuple(boundaries), ahead, oncoming, width, paved, concrete, tone)
 
 
-def _bare_lane(dice: Dice) -> Layout:
+def _bare_lane(dice: RandomSampler) -> Layout:
     """A small road whose edges are its boundaries, now and then with a painted middle."""
     width = dice.between(2.6, 3.4)
     tone = _tone(dice, concrete=dice.chance(0.15))

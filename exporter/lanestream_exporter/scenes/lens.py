@@ -13,7 +13,7 @@ from lanestream_exporter.scenes.noise import TILE, noise_tiles
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from lanestream_exporter.scenes.canvas import Image
+    from lanestream_exporter.scenes.render_target import Image
     from lanestream_exporter.scenes.surface import Colour
     from lanestream_exporter.scenes.view import Layer
 

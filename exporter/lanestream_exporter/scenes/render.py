@@ -12,10 +12,10 @@ import numpy as np
 
 from lanestream_exporter.scenes.annotation import annotate
 from lanestream_exporter.scenes.backdrop import draw_backdrop
-from lanestream_exporter.scenes.canvas import Canvas, Image
 from lanestream_exporter.scenes.lens import develop
 from lanestream_exporter.scenes.light import haze_ground, light_ground
 from lanestream_exporter.scenes.markings import paint_boundaries, paint_others
+from lanestream_exporter.scenes.render_target import Canvas, Image
 from lanestream_exporter.scenes.roadside import Bridge, Item, draw_bridge, draw_item, draw_wall
 from lanestream_exporter.scenes.surface import paint_ground
 from lanestream_exporter.scenes.traffic import Vehicle, draw_vehicle

@@ -14,7 +14,7 @@ from lanestream_exporter.scenes.noise import noise_tiles
 
 if TYPE_CHECKING:
     from lanestream_exporter.scenes.camera import FloatArray
-    from lanestream_exporter.scenes.canvas import Canvas
+    from lanestream_exporter.scenes.render_target import Canvas
     from lanestream_exporter.scenes.surface import Colour
     from lanestream_exporter.scenes.view import Layer
 

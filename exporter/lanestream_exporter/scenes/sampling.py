@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lanestream_exporter.scenes.camera import Camera
-from lanestream_exporter.scenes.dice import Dice
 from lanestream_exporter.scenes.ground import grey, sample_paintwork, sample_patches, sample_surface
 from lanestream_exporter.scenes.layout import Layout, Style, sample_layout
 from lanestream_exporter.scenes.lens import Bonnet, Glare, Lens
 from lanestream_exporter.scenes.light import Air, Light
+from lanestream_exporter.scenes.random_sampler import RandomSampler
 from lanestream_exporter.scenes.road import Course, Pose, Road
 from lanestream_exporter.scenes.scene import Scene
 from lanestream_exporter.scenes.surroundings import (
@@ -49,11 +49,11 @@ class Weather:
 
 def sample_scene(rng: np.random.Generator, width: int, height: int) -> Scene:
     """A random scene for a still picture of the given size in pixels."""
-    dice = Dice(rng)
+    dice = RandomSampler(rng)
     return compose_scene(dice, (width, height), dice.weighed(STYLES), sample_weather(dice), STILL_LENGTH)
 
 
-def compose_scene(dice: Dice, size: tuple[int, int], style: Style, weather: Weather, length: float) -> Scene:
+def compose_scene(dice: RandomSampler, size: tuple[int, int], style: Style, weather: Weather, length: float) -> Scene:
     """A random scene of a given style and weather with `length` metres of road ahead."""
     layout = sample_layout(dice, style)
     course = sample_course(dice, style, length)
@@ -81,7 +81,7 @@ def compose_scene(dice: Dice, size: tuple[int, int], style: Style, weather: Weat
     )
 
 
-def sample_weather(dice: Dice) -> Weather:
+def sample_weather(dice: RandomSampler) -> Weather:
     """Mostly clear days; one scene in twelve at night."""
     night, dull = dice.chance(0.08), dice.chance(0.25)
     wet = dull and dice.chance(0.4)
@@ -89,7 +89,7 @@ def sample_weather(dice: Dice) -> Weather:
     return Weather(night, dull, wet, fog)
 
 
-def sample_camera(dice: Dice, size: tuple[int, int]) -> Camera:
+def sample_camera(dice: RandomSampler, size: tuple[int, int]) -> Camera:
     """A dash camera of the given picture size (width, height)."""
     width, height = size
     view = dice.between(42.0, 70.0) if dice.chance(0.7) else dice.between(70.0, 100.0)
@@ -97,7 +97,7 @@ def sample_camera(dice: Dice, size: tuple[int, int]) -> Camera:
     return Camera(width, height, view, mount, height * dice.between(0.32, 0.63))
 
 
-def sample_course(dice: Dice, style: Style, length: float) -> Course:
+def sample_course(dice: RandomSampler, style: Style, length: float) -> Course:
     """A course whose curvature wanders; straight roads are as common as they are outside."""
     spacing = KNOT_SPACING[style]
     knots = int((length + 2.0 * START) / spacing) + 2
@@ -110,14 +110,14 @@ def sample_course(dice: Dice, style: Style, length: float) -> Course:
     return Course(spacing, tuple(values), bend)
 
 
-def _pose(dice: Dice, layout: Layout) -> Pose:
+def _pose(dice: RandomSampler, layout: Layout) -> Pose:
     """Somewhere in the lane, now and then changing it; the heading takes in the camera's own yaw."""
     between_lanes = dice.chance(0.08) and len(layout.ahead) > 1
     u = dice.between(-0.5, 0.5) * layout.lane_width if between_lanes else dice.around(0.22)
     return Pose(START, u, dice.around(0.025 if layout.style == "highway" else 0.04))
 
 
-def _light(dice: Dice, weather: Weather) -> Light:
+def _light(dice: RandomSampler, weather: Weather) -> Light:
     left = dice.between(0.22, 0.65)
     shade: Colour = (min(1.0, left * 1.12), left, left * 0.92)
     if weather.night:
@@ -125,13 +125,13 @@ def _light(dice: Dice, weather: Weather) -> Light:
     return Light(shade, sun=0.0 if weather.dull else dice.around(0.7))
 
 
-def _air(dice: Dice, weather: Weather, skyline: Colour) -> Air:
+def _air(dice: RandomSampler, weather: Weather, skyline: Colour) -> Air:
     if weather.night:
         return Air((0.02, 0.02, 0.02), 400.0)
     return Air(skyline, min(weather.fog, dice.between(500.0, 4000.0)))
 
 
-def sample_lens(dice: Dice, weather: Weather) -> Lens:
+def sample_lens(dice: RandomSampler, weather: Weather) -> Lens:
     """A camera's settings and faults: most pictures are good, some are poor in one or two ways."""
     dark = dice.chance(0.1) and not weather.night
     exposure = dice.between(0.1, 0.45) if dark else dice.between(0.75, 1.25)
@@ -158,7 +158,7 @@ def sample_lens(dice: Dice, weather: Weather) -> Lens:
     )
 
 
-def _bonnet(dice: Dice) -> Bonnet:
+def _bonnet(dice: RandomSampler) -> Bonnet:
     tone = dice.between(0.03, 0.15) if dice.chance(0.6) else dice.between(0.2, 0.6)
     colour = grey(dice, tone) if dice.chance(0.7) else (0.15 * tone, 0.2 * tone, tone)
     return Bonnet(dice.between(0.03, 0.14), dice.between(0.0, 0.06), colour, dice.between(0.0, 0.5))

@@ -13,8 +13,8 @@ from lanestream_exporter.scenes.roadside import Bridge, Item, ItemKind, Wall, Wa
 from lanestream_exporter.scenes.traffic import Vehicle, VehicleKind
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.dice import Dice
     from lanestream_exporter.scenes.layout import Layout, Style
+    from lanestream_exporter.scenes.random_sampler import RandomSampler
     from lanestream_exporter.scenes.surface import Colour
 
 LEAVES: tuple[Colour, ...] = (
@@ -60,7 +60,7 @@ class Stage:
     length: float
 
 
-def sample_walls(dice: Dice, layout: Layout) -> tuple[Wall, ...]:
+def sample_walls(dice: RandomSampler, layout: Layout) -> tuple[Wall, ...]:
     """Barriers, rails and kerbs at the edges of the pavement."""
     right, left = layout.paved
     if layout.style == "street":
@@ -76,7 +76,7 @@ def sample_walls(dice: Dice, layout: Layout) -> tuple[Wall, ...]:
     )
 
 
-def _wall(dice: Dice, kind: WallKind, u: float, outwards: float) -> Wall:
+def _wall(dice: RandomSampler, kind: WallKind, u: float, outwards: float) -> Wall:
     low, high, away = WALL_HEIGHTS[kind]
     # The face of a wall away from the sun is darker than the road.
     shade = dice.between(0.2, 0.7) if dice.chance(0.45) else 1.0
@@ -84,7 +84,7 @@ def _wall(dice: Dice, kind: WallKind, u: float, outwards: float) -> Wall:
     return Wall(kind, u + outwards * away, dice.between(low, high), colour)
 
 
-def sample_items(dice: Dice, layout: Layout, length: float) -> tuple[Item, ...]:
+def sample_items(dice: RandomSampler, layout: Layout, length: float) -> tuple[Item, ...]:
     """Trees, posts, signs and houses along `length` metres of road."""
     items: list[Item] = []
     woods = dice.between(0.0, 0.12) if dice.chance(0.75) else 0.0
@@ -99,7 +99,7 @@ def sample_items(dice: Dice, layout: Layout, length: float) -> tuple[Item, ...]:
     return tuple(items)
 
 
-def _tree(dice: Dice, length: float, side: float, away: float) -> Item:
+def _tree(dice: RandomSampler, length: float, side: float, away: float) -> Item:
     u = side * (away + dice.between(0.0, 26.0))
     s, colour = dice.between(0.0, length), dice.pick(LEAVES)
     if dice.chance(0.7):
@@ -109,7 +109,7 @@ def _tree(dice: Dice, length: float, side: float, away: float) -> Item:
     return Item("bush", s, u, tall, 1.6 * tall, colour, dice.seed())
 
 
-def _house(dice: Dice, length: float, side: float, away: float) -> Item:
+def _house(dice: RandomSampler, length: float, side: float, away: float) -> Item:
     u = side * (away + dice.between(0.0, 14.0))
     colour = grey(dice, dice.between(0.3, 0.8))
     tint = dice.between(0.75, 1.0)
@@ -117,7 +117,7 @@ def _house(dice: Dice, length: float, side: float, away: float) -> Item:
     return Item("house", dice.between(20.0, length), u, dice.between(3.0, 15.0), dice.between(8.0, 18.0), walls, 0)
 
 
-def _posts(dice: Dice, side: float, edge: float, length: float) -> list[Item]:
+def _posts(dice: RandomSampler, side: float, edge: float, length: float) -> list[Item]:
     """A row of posts or lamps, and a few signs."""
     items: list[Item] = []
     if dice.chance(0.4):
@@ -134,7 +134,7 @@ def _posts(dice: Dice, side: float, edge: float, length: float) -> list[Item]:
     return items
 
 
-def sample_bridges(dice: Dice, layout: Layout, length: float) -> tuple[Bridge, ...]:
+def sample_bridges(dice: RandomSampler, layout: Layout, length: float) -> tuple[Bridge, ...]:
     """Bridges and sign gantries over the road."""
     bridges = []
     chance = 0.22 if layout.style == "highway" else 0.04
@@ -154,7 +154,7 @@ def sample_bridges(dice: Dice, layout: Layout, length: float) -> tuple[Bridge, .
     return tuple(bridges)
 
 
-def sample_shadows(dice: Dice, layout: Layout, stage: Stage) -> tuple[Shadow, ...]:
+def sample_shadows(dice: RandomSampler, layout: Layout, stage: Stage) -> tuple[Shadow, ...]:
     """Shadows on the road: of bridges, walls, trees, posts and houses."""
     lean = dice.around(0.7)
     shadows: list[Shadow] = [
@@ -175,7 +175,7 @@ def sample_shadows(dice: Dice, layout: Layout, stage: Stage) -> tuple[Shadow, ..
     return tuple(shadows)
 
 
-def _tree_shadows(dice: Dice, layout: Layout, length: float) -> list[Shadow]:
+def _tree_shadows(dice: RandomSampler, layout: Layout, length: float) -> list[Shadow]:
     """Shade of trees on one side of the road, in stretches."""
     side = dice.pick((-1.0, 1.0))
     return [
@@ -194,7 +194,7 @@ def _tree_shadows(dice: Dice, layout: Layout, length: float) -> list[Shadow]:
     ]
 
 
-def sample_traffic(dice: Dice, layout: Layout, start: float, length: float) -> tuple[Vehicle, ...]:
+def sample_traffic(dice: RandomSampler, layout: Layout, start: float, length: float) -> tuple[Vehicle, ...]:
     """Vehicles in the lanes from `start` on, at least a few car lengths apart, and parked ones in streets."""
     vehicles: list[Vehicle] = []
     density = dice.pick((0.0, 0.008, 0.015, 0.03))
@@ -212,7 +212,7 @@ def sample_traffic(dice: Dice, layout: Layout, start: float, length: float) -> t
     return tuple(vehicles)
 
 
-def _queue(dice: Dice, lane: float, reach: tuple[float, float], density: float, speed: float) -> list[Vehicle]:
+def _queue(dice: RandomSampler, lane: float, reach: tuple[float, float], density: float, speed: float) -> list[Vehicle]:
     """Vehicles of one lane, which all go at the same speed and so keep their distances."""
     vehicles: list[Vehicle] = []
     s = reach[0]
@@ -223,7 +223,7 @@ def _queue(dice: Dice, lane: float, reach: tuple[float, float], density: float, 
     return vehicles
 
 
-def sample_vehicle(dice: Dice, s: float, u: float, speed: float) -> Vehicle:
+def sample_vehicle(dice: RandomSampler, s: float, u: float, speed: float) -> Vehicle:
     """One vehicle of a usual size."""
     kind = dice.weighed(VEHICLES)
     length, width, height = VEHICLE_SIZES[kind]
@@ -241,7 +241,7 @@ def sample_vehicle(dice: Dice, s: float, u: float, speed: float) -> Vehicle:
     )
 
 
-def sample_backdrop(dice: Dice, *, night: bool, dull: bool) -> Backdrop:
+def sample_backdrop(dice: RandomSampler, *, night: bool, dull: bool) -> Backdrop:
     """Sky and horizon."""
     if dull:
         level = dice.between(0.6, 0.9)

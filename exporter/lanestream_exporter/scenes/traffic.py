@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lanestream_exporter.scenes.camera import FloatArray
-    from lanestream_exporter.scenes.canvas import Canvas
+    from lanestream_exporter.scenes.render_target import Canvas
     from lanestream_exporter.scenes.surface import Colour
 
 NEAREST = 0.7  # metres ahead of the lens where vehicles are cut off

@@ -14,8 +14,8 @@ from torch.nn import functional
 
 from lanestream.errors import CheckpointError
 from lanestream_exporter.alexnet import AlexNet, initialise, load_state, normalise
-from lanestream_exporter.augment import augmented
-from lanestream_exporter.patchstore import PatchStore
+from lanestream_exporter.samples.augment import augmented
+from lanestream_exporter.samples.patch_store import PatchStore
 from lanestream_exporter.training.config import ClassifierConfig
 from lanestream_exporter.training.loop import CHOOSES, Batch
 from lanestream_exporter.training.patchfiles import PatchSource

@@ -12,7 +12,7 @@ from pydantic import model_validator as checked
 
 from lanestream.errors import SettingsError
 from lanestream_exporter.alexnet import Shape
-from lanestream_exporter.datasets.between import Between
+from lanestream_exporter.datasets.label_propagation import Between
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 

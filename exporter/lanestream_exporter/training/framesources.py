@@ -7,8 +7,8 @@ from pathlib import Path
 
 from lanestream.processors import processors
 from lanestream_exporter.datasets.splits import data_root, real_frames, training_frames
-from lanestream_exporter.roadframes import read_frames, rendered_frames, road_frames
-from lanestream_exporter.scenefiles import files_of
+from lanestream_exporter.samples.cache import files_of
+from lanestream_exporter.samples.road_frames import read_frames, rendered_frames, road_frames
 from lanestream_exporter.training.ownframes import own_frames
 from lanestream_exporter.training.regressor import FrameData, FrameSource
 

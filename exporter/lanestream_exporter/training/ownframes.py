@@ -6,12 +6,12 @@ import hashlib
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-from lanestream.lanes import Image
-from lanestream_exporter.datasets.between import frames_between
+from lanestream.road.view import Image
+from lanestream_exporter.datasets.label_propagation import frames_between
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.datasets.splits import refuse_leak, split_by_group
-from lanestream_exporter.rendering import PatchStores
+from lanestream_exporter.samples.patch_files import PatchStores
 from lanestream_exporter.training.config import Frames, PatchData
 
 FrameStream = Iterator[tuple[LabelledFrame, Image]]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lanestream.errors import LabelError
-from lanestream_exporter.patchstore import PatchStore, read_stores
+from lanestream_exporter.samples.patch_store import PatchStore, read_stores
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ import torch
 from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
+from lanestream.detection.regression_detector import RoadCropGeometry
 from lanestream.errors import CheckpointError, LabelError
-from lanestream.geometry import CanvasGeometry
 from lanestream_exporter.alexnet import load_state, normalise
-from lanestream_exporter.augment import photographed
-from lanestream_exporter.canvases import SHARES, Target, Warp, plain_warp, sample
 from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss
-from lanestream_exporter.roadframes import RoadFrame
+from lanestream_exporter.samples.augment import photographed
+from lanestream_exporter.samples.road_crops import SHARES, Target, Warp, plain_warp, sample
+from lanestream_exporter.samples.road_frames import RoadFrame
 from lanestream_exporter.training.config import Light, NetworkSize, PatchData, Share, TrainConfig
 from lanestream_exporter.training.loop import CHOOSES, Batch
 
@@ -69,7 +69,7 @@ class RegressorTask:
     ) -> None:
         self._config = config
         self._sources = {source.name: source for source in sources}
-        self._geometry = CanvasGeometry(config.network.size)
+        self._geometry = RoadCropGeometry(config.network.size)
         self._checks = {source.name: self._plain(source.check) for source in sources}
         self.network = network
         counts = {s.name: {"train": len(s.train), "check": len(s.check)} for s in sources}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from lanestream_exporter.alexnet import normalise
-from lanestream_exporter.patchstore import PatchStore
+from lanestream_exporter.samples.patch_store import PatchStore
 from lanestream_exporter.training.device import autocast
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from lanestream.processors import processors
 from lanestream_exporter.datasets.splits import data_root, real_frames, training_frames
-from lanestream_exporter.rendering import PatchStores
-from lanestream_exporter.scenefiles import files_of
+from lanestream_exporter.samples.cache import files_of
+from lanestream_exporter.samples.patch_files import PatchStores
 from lanestream_exporter.training.config import PatchData
 from lanestream_exporter.training.ownframes import own_stores
 from lanestream_exporter.training.patchfiles import PatchFiles

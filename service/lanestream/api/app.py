@@ -15,12 +15,12 @@ from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 
 from lanestream import __version__
-from lanestream.api import rest, stream
+from lanestream.api import rest, websocket
 from lanestream.api.problems import Problem, problem_of, problem_response
 from lanestream.api.service import Draw, Service
 from lanestream.errors import LanestreamError, ProtocolError, one_line
 from lanestream.protocol import error_message
-from lanestream.sessions.thread_runner import ThreadRunner
+from lanestream.workers.thread_pool import ThreadPool
 
 if TYPE_CHECKING:
     from lanestream.engine import Engine
@@ -37,7 +37,7 @@ def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = No
     service = Service(settings, draw)
     if engine is not None:
         threads = settings.threads_of(1)
-        service.install(ThreadRunner(engine, settings.image_limits, threads, service.metrics.batch))
+        service.install(ThreadPool(engine, settings.image_limits, threads, service.metrics.batch))
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -51,7 +51,7 @@ def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = No
         lifespan=life,
     )
     app.state.service = service
-    _include_routes(app, settings, with_keys=bool(service.gatekeeper.keys))
+    _include_routes(app, settings, with_keys=bool(service.authenticator.keys))
     if settings.allowed_origins:
         app.add_middleware(
             CORSMiddleware,
@@ -67,7 +67,7 @@ def create_app(engine: Engine | None, settings: Settings, draw: Draw | None = No
 
 
 def _include_routes(app: FastAPI, settings: Settings, *, with_keys: bool) -> None:
-    """Adds the routes, those that are not for everybody behind the gatekeeper."""
+    """Adds the routes, those that are not for everybody behind the authenticator."""
     guard = [Depends(rest.admitted)]
     if with_keys:
         guard.append(Depends(HTTPBearer(auto_error=False, description="An API key, as `lanestream key` makes them.")))
@@ -77,7 +77,7 @@ def _include_routes(app: FastAPI, settings: Settings, *, with_keys: bool) -> Non
         app.include_router(rest.metrics_router, dependencies=guard, responses=rest.REFUSALS)
     elif settings.metrics_access == "open":
         app.include_router(rest.metrics_router)
-    app.include_router(stream.router)
+    app.include_router(websocket.router)
 
 
 async def _tell(request: Request, error: Exception) -> JSONResponse:

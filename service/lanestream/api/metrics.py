@@ -22,7 +22,7 @@ from lanestream.errors import (
 
 if TYPE_CHECKING:
     from lanestream.inference.batcher import BatchReport
-    from lanestream.sessions.offers import Offer
+    from lanestream.workers.capabilities import Offer
 
 DropReason = Literal["superseded", "expired", "overload", "decode_error", "too_large", "rate", "disconnected", "error"]
 ResumeResult = Literal["resumed", "unknown", "refused"]

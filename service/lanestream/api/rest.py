@@ -10,27 +10,27 @@ import cv2
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel
 
-from lanestream.api.accept import preferred
+from lanestream.api.content_negotiation import preferred
 from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
 from lanestream.api.service import Service
 from lanestream.asyncapi import document
 from lanestream.errors import NotAcceptableError, one_line
-from lanestream.imaging import decode
+from lanestream.images.decoding import decode
 from lanestream.messages import lanes_message
 from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
-from lanestream.sessions.caller import Caller
-from lanestream.sessions.worker import EncodedFrame
+from lanestream.streaming.caller import Caller
+from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
     from lanestream.api.service import Draw
     from lanestream.messages import ProcessedFrame
-    from lanestream.sessions.manager import OpenSession
-    from lanestream.sessions.offers import Offer
+    from lanestream.streaming.session_registry import OpenSession
+    from lanestream.workers.capabilities import Offer
 
 # For everybody: whether the service lives, and what its own repository tells as well.
 open_router = APIRouter()
-# For those whom the gatekeeper lets in.
+# For those whom the authenticator lets in.
 router = APIRouter()
 # For those whom the setting `metrics_access` names.
 metrics_router = APIRouter()
@@ -96,7 +96,7 @@ REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
 
 async def admitted(request: Request) -> Caller:
     """Who asks. Raises UnauthorizedError or ForbiddenError where they may not."""
-    return _service(request).gatekeeper.admit(request)
+    return _service(request).authenticator.admit(request)
 
 
 def _camera(

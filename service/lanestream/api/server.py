@@ -14,22 +14,22 @@ from typing import TYPE_CHECKING, Final
 import cv2
 import uvicorn
 
-from lanestream.api.access import warn_if_open
 from lanestream.api.app import create_app
-from lanestream.api.heads import punctual
+from lanestream.api.auth import warn_if_open
+from lanestream.api.header_timeout import punctual
 from lanestream.errors import SettingsError
 from lanestream.logs import log_config
-from lanestream.sessions.parcels import Setup
-from lanestream.sessions.process_runner import ProcessRunner
-from lanestream.sessions.thread_runner import ThreadRunner
+from lanestream.workers.ipc import Setup
+from lanestream.workers.process_pool import ProcessPool
+from lanestream.workers.thread_pool import ThreadPool
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from lanestream.api.service import Draw, Service
     from lanestream.engine import Engine
-    from lanestream.sessions.runner import FrameRunner
     from lanestream.settings import Settings
+    from lanestream.workers.pool import WorkerPool
 
 _log = logging.getLogger(__name__)
 _BACKLOG: Final = 2048
@@ -91,7 +91,7 @@ class Server(uvicorn.Server):
 async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     host, port = listener.getsockname()[:2]
-    warn_if_open(app.state.service.gatekeeper, host, loopback=ipaddress.ip_address(host).is_loopback)
+    warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
     _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
     try:
         runner = await _runner(app.state.service, load)
@@ -107,10 +107,10 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
     await serving
 
 
-async def _runner(service: Service, load: Callable[[], Engine]) -> FrameRunner:
+async def _runner(service: Service, load: Callable[[], Engine]) -> WorkerPool:
     """What works on frames, warm: worker processes, or threads of this one where the settings say so."""
     settings, observe = service.settings, service.metrics.batch
     if settings.processes == 0:
-        return ThreadRunner(await asyncio.to_thread(load), settings.image_limits, settings.threads_of(1), observe)
+        return ThreadPool(await asyncio.to_thread(load), settings.image_limits, settings.threads_of(1), observe)
     setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
-    return await ProcessRunner.started(setup, settings.processes, settings.threads_of, observe)
+    return await ProcessPool.started(setup, settings.processes, settings.threads_of, observe)

@@ -7,20 +7,20 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from lanestream.api.access import Gatekeeper
-from lanestream.api.bodies import BodyReader
+from lanestream.api.auth import Authenticator
 from lanestream.api.metrics import Metrics
+from lanestream.api.request_body import BodyReader
 from lanestream.errors import DrainingError, NotReadyError
 from lanestream.protocol import Limits
-from lanestream.sessions.manager import SessionManager
-from lanestream.sessions.store import MemoryStore, SessionStore
+from lanestream.streaming.session_registry import SessionRegistry
+from lanestream.streaming.store import MemoryStore, SessionStore
 
 if TYPE_CHECKING:
-    from lanestream.api.stream import StreamHandler
-    from lanestream.lanes import Image
+    from lanestream.api.websocket import StreamHandler
     from lanestream.protocol import LanesMessage
-    from lanestream.sessions.runner import FrameRunner
+    from lanestream.road.view import Image
     from lanestream.settings import Settings
+    from lanestream.workers.pool import WorkerPool
 
 Draw = Callable[["Image", "LanesMessage"], "Image"]
 
@@ -36,17 +36,17 @@ class Service:
     def __init__(self, settings: Settings, draw: Draw | None = None) -> None:
         self.settings = settings
         self.draw = draw
-        self.gatekeeper = Gatekeeper.of(settings)
+        self.authenticator = Authenticator.of(settings)
         self.metrics = Metrics()
         self.bodies = BodyReader(settings.max_bytes, settings.max_sessions, settings.body_s)
         self.streams: set[StreamHandler] = set()
         self.draining = False
         self._store = _store(settings)
-        self.sessions = SessionManager(settings.session_limits, self._store)
-        self._runner: FrameRunner | None = None
+        self.sessions = SessionRegistry(settings.session_limits, self._store)
+        self._runner: WorkerPool | None = None
 
     @property
-    def runner(self) -> FrameRunner:
+    def runner(self) -> WorkerPool:
         """What works on frames. Raises NotReadyError before `install`."""
         if self._runner is None:
             raise NotReadyError("the networks are still being loaded", "ask /readyz, try again in a moment")
@@ -64,7 +64,7 @@ class Service:
         if not self.runner.works:
             raise NotReadyError("the worker processes are being started again", "ask /readyz, try again in a moment")
 
-    def install(self, runner: FrameRunner) -> None:
+    def install(self, runner: WorkerPool) -> None:
         """Makes the service ready with a warm runner."""
         for offer in runner.offers.all:
             self.metrics.loaded(offer)
@@ -96,6 +96,6 @@ def _store(settings: Settings) -> SessionStore:
     if settings.redis_url is None:
         return MemoryStore()
     # Only who has replicas needs the package.
-    from lanestream.sessions.redis_store import RedisStore
+    from lanestream.streaming.redis_store import RedisStore
 
     return RedisStore(settings.redis_url.get_secret_value())

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.errors import NoDetectorError
-from lanestream.geometry import RoadView
-from lanestream.lanes import Candidate, Curve, Detection, Image
 from lanestream.protocol import DetectorName
+from lanestream.road.curve import Curve
+from lanestream.road.results import Candidate, Detection
+from lanestream.road.view import Image, RoadView
 
 if TYPE_CHECKING:
-    from lanestream.detection.candidates import Survey
-    from lanestream.detection.prior import RoadGlance, RoadPrior
+    from lanestream.detection.ego_prior import EgoPrior, EgoPriorEstimator
+    from lanestream.detection.proposals import Survey
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -44,7 +45,7 @@ class Prepared:
     candidates: tuple[Candidate, ...] = ()
     horizon_weight: float = 0.0
     looks: tuple[RoadView, ...] = ()
-    prior: RoadPrior | None = None
+    prior: EgoPrior | None = None
 
     @cached_property
     def inputs(self) -> NDArray[np.uint8]:
@@ -54,7 +55,7 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class Findings:
+class Detections:
     """What a detector found in a frame: boundaries from left to right, and the road view with the horizon it found.
 
     `horizon_weight` (0 to 1) tells how much the frame had to say about where its horizon is.
@@ -65,7 +66,7 @@ class Findings:
     horizon_weight: float
 
 
-class LaneDetector(Protocol):
+class Detector(Protocol):
     """The two halves of a detector. All is pure and may run in any thread."""
 
     def survey(self, image: Image, horizon: float | None = None) -> Survey | None:
@@ -77,7 +78,7 @@ class LaneDetector(Protocol):
         image: Image,
         horizon: float | None = None,
         expected: Sequence[Curve] = (),
-        prior: RoadPrior | None = None,
+        prior: EgoPrior | None = None,
         survey: Survey | None = None,
     ) -> Prepared:
         """Network inputs for a BGR image; `horizon` is its row, give or take a nod of the camera, where it is known.
@@ -87,7 +88,7 @@ class LaneDetector(Protocol):
         """
         ...
 
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Findings:
+    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Detections:
         """What the network's outputs for `prepared.inputs`, row by row, say of the frame."""
         ...
 
@@ -206,10 +207,10 @@ class Pipeline:
     """
 
     name: DetectorName
-    detector: LaneDetector
+    detector: Detector
     network: Network
-    glance: RoadGlance | None = None
-    first_look: RoadGlance | None = None
+    glance: EgoPriorEstimator | None = None
+    first_look: EgoPriorEstimator | None = None
 
     def prepare(
         self,
@@ -218,7 +219,7 @@ class Pipeline:
         expected: Sequence[Curve] = (),
         glanced: float | None = None,
     ) -> Steps[Prepared]:
-        """The detector's first half, after the glance; arguments as for `LaneDetector.prepare`.
+        """The detector's first half, after the glance; arguments as for `Detector.prepare`.
 
         `glanced` is the horizon's row that the glance at the frame before saw. It is steadier than `horizon`, which
         what is found on the road moves about, and a glance at the right place needs no second one.

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.edges import paint_grey
-from lanestream.geometry import RoadView, Scaling, visible_spans
-from lanestream.lanes import Curve, FloatArray, Image, curve_columns
+from lanestream.detection.features import paint_grey
+from lanestream.road.curve import Curve, FloatArray, curve_columns
+from lanestream.road.view import Image, RoadView, Scaling, visible_spans
 
 # hypot(1, slope) of an ego boundary: half a lane of 3.6 m beside a camera 1.45 m high.
 USUAL_LEANING: Final = 1.6

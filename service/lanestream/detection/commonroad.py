@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lanestream.lanes import FloatArray, curve_basis
+from lanestream.road.curve import FloatArray, curve_basis
 
 
 @dataclass(frozen=True)

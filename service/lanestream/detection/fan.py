@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from lanestream.detection.marking_filter import Ridges
 from lanestream.detection.perspective import Perspective
-from lanestream.detection.ridges import Ridges
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.edges import Edges
+from lanestream.detection.features import Edges
 
 _CIRCLE: Final = 360
 

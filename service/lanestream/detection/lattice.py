@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
+from lanestream.road.curve import FloatArray
 
 # Lanes are 2.5 to 4.5 m wide and cameras 1 to 2.4 m high; what is usual stands in where one boundary was seen alone.
 USUAL_WIDTH: Final = 2.4
@@ -19,7 +19,7 @@ _NARROWEST, _WIDEST = 1.2, 4.5
 
 
 @dataclass(frozen=True)
-class Lattice:
+class LaneSpacing:
     """The ego lane's boundaries as slopes, `left` and `right`, from which others are whole lanes away.
 
     A line off a place of the lattice by `spread` lane widths counts less, down to `least`; places beyond the next
@@ -33,7 +33,7 @@ class Lattice:
     outer: float = 0.6
 
     @classmethod
-    def of(cls, left: float | None, right: float | None) -> Lattice:
+    def of(cls, left: float | None, right: float | None) -> LaneSpacing:
         """The lattice of one or two boundaries; the missing one is a usual lane away."""
         if left is not None:
             return cls(left, right if right is not None else left + USUAL_WIDTH)

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.geometry import RoadView, Scaling
-from lanestream.lanes import Curve, FloatArray, curve_columns, under_horizon
+from lanestream.road.curve import Curve, FloatArray, curve_columns, under_horizon
+from lanestream.road.view import RoadView, Scaling
 
 # The two rows, as shares of the depth, at which lines are told, compared and suppressed.
 NEAR: Final = 1.0

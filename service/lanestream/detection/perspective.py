@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.ridges import Ridges
-from lanestream.lanes import FloatArray
+from lanestream.detection.marking_filter import Ridges
+from lanestream.road.curve import FloatArray
 
 
 @dataclass(frozen=True)

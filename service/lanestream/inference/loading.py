@@ -7,16 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from lanestream.errors import ProviderError
-from lanestream.inference.model import OnnxModel
-from lanestream.inference.network import LoadedNetwork
+from lanestream.inference.loaded_model import LoadedModel
+from lanestream.inference.onnx_model import OnnxModel
 from lanestream.inference.openvino_model import OpenVinoModel
 from lanestream.inference.providers import Loadable, Offer, attempts, offered, require
 from lanestream.runtime import DEFAULT_OPTIONS, Provider, RuntimeOptions
 
 
-def load_network(
+def load_model(
     path: Path, provider: Provider = "auto", options: RuntimeOptions = DEFAULT_OPTIONS, offer: Offer | None = None
-) -> LoadedNetwork:
+) -> LoadedModel:
     """The network in the file at `path`; `auto` takes the first provider that can be had, and says what it passed over.
 
     `offer` is what is installed, found out where None. Raises ModelError for a file that can't be served, ProviderError
@@ -43,7 +43,7 @@ def load_network(
     raise AssertionError("the CPU is the last one tried")
 
 
-def _load(path: Path, provider: Loadable, options: RuntimeOptions, reason: str) -> LoadedNetwork:
+def _load(path: Path, provider: Loadable, options: RuntimeOptions, reason: str) -> LoadedModel:
     if provider == "openvino":
         return OpenVinoModel.load(path, options, reason)
     return OnnxModel.load(path, provider, options, reason)

@@ -7,14 +7,14 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from lanestream.detection.regression import OUTPUTS
+from lanestream.detection.regression_detector import OUTPUTS
 from lanestream.errors import ModelError
 
 METADATA_KEY: Final = "lanestream"
 
 
-class StripInfo(BaseModel):
-    """How the strips were cut that a classifier was trained on; see `geometry.StripGeometry`."""
+class PatchInfo(BaseModel):
+    """How the strips were cut that a classifier was trained on; see `geometry.PatchGeometry`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -24,8 +24,8 @@ class StripInfo(BaseModel):
     lean: float = Field(default=0.0, ge=0.0)
 
 
-class CanvasInfo(BaseModel):
-    """The canonical picture that a regressor was trained on; see `geometry.CanvasGeometry`."""
+class RoadCropInfo(BaseModel):
+    """The canonical picture that a regressor was trained on; see `geometry.RoadCropGeometry`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -55,7 +55,7 @@ class ClassifierInfo(_Description):
 
     kind: Literal["classifier"]
     classes: tuple[str, ...]
-    strip: StripInfo
+    strip: PatchInfo
     temperature: float = Field(gt=0.0)
 
     @property
@@ -73,7 +73,7 @@ class RegressorInfo(_Description):
     """A network that tells the ego lane's boundaries from a canonical picture; see `detection.regression`."""
 
     kind: Literal["regressor"]
-    canvas: CanvasInfo
+    canvas: RoadCropInfo
 
     @property
     def input_size(self) -> int:

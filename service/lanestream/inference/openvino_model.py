@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.errors import ModelError, ProviderError, one_line
+from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import METADATA_KEY, ModelInfo, parse_info, require_file
-from lanestream.inference.network import LoadedNetwork, Placement
 from lanestream.processors import processors
 from lanestream.runtime import DEFAULT_OPTIONS, RuntimeOptions
 
@@ -25,7 +25,7 @@ BUCKETS: Final = tuple(range(1, 17))
 _TELEMETRY: Final = "openvino_telemetry"
 
 
-class OpenVinoModel(LoadedNetwork):
+class OpenVinoModel(LoadedModel):
     """A network that OpenVINO runs, in the precision of its file."""
 
     def __init__(self, compiled: Any, info: ModelInfo, placement: Placement) -> None:

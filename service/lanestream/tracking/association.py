@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lanestream.lanes import FloatArray
-from lanestream.tracking.filter import mahalanobis
-from lanestream.tracking.track import Track
+from lanestream.road.curve import FloatArray
+from lanestream.tracking.kalman import mahalanobis
+from lanestream.tracking.tracks import Track
 
 # Chi-square with three degrees of freedom, 99.7 %.
 GATE = 14.2

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.lanes import FloatArray
-from lanestream.tracking.filter import Rows, boundary_filter
-from lanestream.tracking.track import Track
+from lanestream.road.curve import FloatArray
+from lanestream.tracking.kalman import Rows, boundary_filter
+from lanestream.tracking.tracks import Track
 
 _STATE: Final = 6
 _NUMBERS: Final = "<f8"

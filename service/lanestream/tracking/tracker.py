@@ -8,13 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lanestream.geometry import RoadView, visible_spans
-from lanestream.lanes import Curve, Detection, EgoLane, FloatArray, FrameResult, LaneBoundary, LaneChange
+from lanestream.road.curve import Curve, FloatArray
+from lanestream.road.results import Detection, EgoLane, FrameResult, LaneBoundary, LaneChange
+from lanestream.road.view import RoadView, visible_spans
 from lanestream.tracking.association import associate, recover
-from lanestream.tracking.filter import Motion, Rows, boundary_filter
-from lanestream.tracking.positions import LaneWidth, Sides, positions
+from lanestream.tracking.ego_lane import LaneWidth, Sides, positions
+from lanestream.tracking.kalman import Motion, Rows, boundary_filter
 from lanestream.tracking.state import TrackerState, TrackState, told_rows
-from lanestream.tracking.track import Track
+from lanestream.tracking.tracks import Track
 
 
 @dataclass(frozen=True)

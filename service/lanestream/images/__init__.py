@@ -1,0 +1,1 @@
+"""Image files: their headers, limits and decoding."""

@@ -1,0 +1,1 @@
+"""Streams and their sessions, without sockets: protocol, registry, stores."""

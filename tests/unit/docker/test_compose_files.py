@@ -1,0 +1,187 @@
+"""The compose file, and what it gives Prometheus and Grafana, without an engine to run them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import fakes
+import pytest
+import yaml
+from prometheus_client.parser import text_string_to_metric_families
+
+from lanestream.api.metrics import DropReason, Metrics
+from lanestream.inference.batcher import BatchReport
+from lanestream.keys import find, read_keys
+from lanestream.settings import Settings
+from lanestream.workers.capabilities import Capabilities
+
+ROOT = Path(__file__).parents[3]
+DOCKER = ROOT / "docker"
+COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text())
+DASHBOARD: dict[str, Any] = json.loads((DOCKER / "grafana/dashboards/lanestream.json").read_text())
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+OURS = ("lanestream", "lanestream-gpu")
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_every_container_is_guarded(name: str) -> None:
+    service = SERVICES[name]
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["restart"] == "unless-stopped"
+    assert service["deploy"]["resources"]["limits"].keys() == {"memory", "pids"}
+    assert "privileged" not in service
+    # Ours are checked by the image itself.
+    assert name in OURS or "test" in service["healthcheck"]
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_ports_are_open_to_this_machine_alone_unless_asked(name: str) -> None:
+    for port in SERVICES[name].get("ports", []):
+        assert re.fullmatch(r"\$\{[A-Z_]+:-127\.0\.0\.1:\d+\}:\d+", port)
+
+
+@pytest.mark.parametrize("name", set(SERVICES) - set(OURS))
+def test_images_of_others_are_pinned(name: str) -> None:
+    assert re.search(r":v?\d", SERVICES[name]["image"])
+
+
+def test_a_profile_starts_one_variant_with_all_that_it_needs() -> None:
+    for variant, own in (("cpu", "lanestream"), ("gpu", "lanestream-gpu")):
+        started = {name for name, service in SERVICES.items() if variant in service["profiles"]}
+        assert started == {own, "redis", "prometheus", "grafana"}
+        assert SERVICES[own]["build"]["target"] == variant
+    assert SERVICES["lanestream-gpu"]["deploy"]["resources"]["reservations"]["devices"][0]["capabilities"] == ["gpu"]
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_service_is_told_settings_that_it_has(name: str) -> None:
+    given = {key.removeprefix("LANESTREAM_").lower() for key in SERVICES[name]["environment"]}
+    assert given <= set(Settings.model_fields)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_container_is_given_longer_to_stop_than_it_drains(name: str) -> None:
+    grace = float(SERVICES[name]["stop_grace_period"].removesuffix("s"))
+    assert grace >= Settings().drain_s + 10
+
+
+def test_secrets_and_mounts_come_from_files_that_are_not_committed_or_are_there() -> None:
+    ignored = (ROOT / ".gitignore").read_text().split()
+    assert "docker/secrets/" in ignored
+    assert all(secret["file"].startswith("secrets/") for secret in COMPOSE["secrets"].values())
+    for service in SERVICES.values():
+        assert set(service.get("secrets", [])) <= set(COMPOSE["secrets"])
+        told = " ".join(map(str, service.get("environment", {}).values()))
+        assert set(re.findall(r"/run/secrets/(\w+)", told)) <= set(service.get("secrets", []))
+        for mount in service.get("volumes", []):
+            source = mount.split(":")[0]
+            assert (DOCKER / source).exists() if source.startswith(".") else source in COMPOSE["volumes"]
+
+
+def test_prometheus_asks_by_the_name_that_the_replicas_answer_to() -> None:
+    (job,) = yaml.safe_load((DOCKER / "prometheus/prometheus.yaml").read_text())["scrape_configs"]
+    (asked,) = job["dns_sd_configs"]
+    for name in OURS:
+        assert asked["names"] == SERVICES[name]["networks"]["metrics"]["aliases"]
+        assert str(asked["port"]) == SERVICES[name]["environment"]["LANESTREAM_PORT"]
+    assert job["job_name"] == "lanestream"
+    assert Path(job["authorization"]["credentials_file"]).name in SERVICES["prometheus"]["secrets"]
+
+
+def test_secrets_are_made_once_and_open_the_service(tmp_path: Path) -> None:
+    script = shutil.copy(DOCKER / "make-secrets", tmp_path)
+    secrets = tmp_path / "secrets"
+
+    def made() -> dict[str, str]:
+        subprocess.run([script, sys.executable, "-m", "lanestream.cli"], check=True, capture_output=True)
+        return {path.name: path.read_text().strip() for path in secrets.iterdir()}
+
+    first = made()
+    assert made() == first
+    keys = read_keys(secrets / "api_keys")
+    for name in ("local", "prometheus"):
+        key = find(keys, first[f"{name}_key"])
+        assert key is not None
+        assert key.name == name
+    assert len(first["grafana_password"]) == 24
+    assert secrets.stat().st_mode & 0o777 == 0o700
+    mounted = [secrets / Path(secret["file"]).name for secret in COMPOSE["secrets"].values()]
+    assert all(path.stat().st_mode & 0o004 for path in mounted)
+
+
+def expressions() -> Iterator[str]:
+    """Every query of the dashboard and of the alerts."""
+    yield from (target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", []))
+    (group,) = yaml.safe_load((DOCKER / "prometheus/alerts.yaml").read_text())["groups"]
+    yield from (rule["expr"] for rule in group["rules"])
+
+
+def exposition() -> str:
+    """What a service tells that everything has happened to once."""
+    metrics = Metrics()
+    for offer in Capabilities.of(fakes.engine().pipelines).all:
+        metrics.loaded(offer)
+    metrics.workers(tuple)
+    metrics.frame_processed({"decode": 1.0}, 0.1)
+    metrics.batch(BatchReport("fake 1", rows=1, questions=1, still_waiting=0, oldest_s=0.0))
+    metrics.socket_closed(1000)
+    metrics.refused("bad_image")
+    return metrics.exposition().decode()
+
+
+def series() -> dict[str, set[str]]:
+    """The labels of each series that Prometheus has of a service, by name."""
+    there = {"up": set[str]()}
+    for family in text_string_to_metric_families(exposition()):
+        for sample in family.samples:
+            there.setdefault(sample.name, set()).update(sample.labels)
+    return {name: labels | {"job", "instance"} for name, labels in there.items()}
+
+
+@pytest.mark.parametrize("expression", sorted(set(expressions())))
+def test_queries_ask_for_series_and_labels_that_there_are(expression: str) -> None:
+    there = series()
+    asked = set(re.findall(r"\b(lane_\w+|process_\w+|up)(?=[{\[ ]|$)", expression))
+    assert asked
+    assert asked <= set(there)
+    labels = {name for group in re.findall(r"by \(([^)]*)\)", expression) for name in group.split(", ")}
+    labels |= set(re.findall(r'(\w+)(?:=~|!=|!~|=)"', expression))
+    assert all(labels <= there[name] for name in asked)
+    reasons = {reason for group in re.findall(r'reason=~?"([^"]*)"', expression) for reason in group.split("|")}
+    assert reasons <= set(get_args(DropReason))
+
+
+def test_the_dashboard_shows_every_metric_of_ours() -> None:
+    shown = " ".join(expressions())
+    for family in text_string_to_metric_families(exposition()):
+        assert not family.name.startswith("lane_") or family.name.endswith("_created") or family.name in shown
+
+
+def test_panels_are_described_and_do_not_overlap() -> None:
+    panels = DASHBOARD["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    taken: set[tuple[int, int]] = set()
+    for panel in panels:
+        place = panel["gridPos"]
+        cells = {(place["x"] + x, place["y"] + y) for x in range(place["w"]) for y in range(place["h"])}
+        assert not cells & taken
+        assert max(x for x, _ in cells) < 24
+        taken |= cells
+        assert panel["type"] == "row" or (panel["title"] and panel["description"] and panel["targets"])
+
+
+def test_the_dashboard_is_provisioned_from_where_it_is_mounted() -> None:
+    provider = yaml.safe_load((DOCKER / "grafana/provisioning/dashboards/lanestream.yaml").read_text())["providers"][0]
+    targets = [mount.split(":")[1] for mount in SERVICES["grafana"]["volumes"]]
+    assert provider["options"]["path"] in targets
+    source = yaml.safe_load((DOCKER / "grafana/provisioning/datasources/prometheus.yaml").read_text())["datasources"][0]
+    assert source["url"] == "http://prometheus:9090"

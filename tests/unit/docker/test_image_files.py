@@ -1,0 +1,113 @@
+"""What can be known of the image without an engine to build it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from lanestream.settings import Settings
+
+ROOT = Path(__file__).parents[3]
+DOCKER = ROOT / "docker"
+
+
+def script(name: str) -> ModuleType:
+    """A script of docker/, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, DOCKER / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def instructions() -> list[tuple[str, str]]:
+    """The Dockerfile's instructions in order, each with what follows it, continued lines joined."""
+    text = (DOCKER / "Dockerfile").read_text().replace("\\\n", " ")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    return [(name, " ".join(rest.split())) for name, _, rest in (line.partition(" ") for line in lines)]
+
+
+def values(instruction: str) -> list[str]:
+    return [rest for name, rest in instructions() if name == instruction]
+
+
+def test_the_image_has_a_cpu_and_a_gpu_target_on_a_base_of_choice() -> None:
+    assert instructions()[0][0] == "ARG"
+    assert instructions()[0][1].startswith("BASE_IMAGE=")
+    stages = {rest.split()[-1]: rest.split()[0] for rest in values("FROM")}
+    assert stages["cpu"] == stages["gpu"] == "runtime"
+    assert stages["runtime"] == stages["builder"] == "${BASE_IMAGE}"
+
+
+def test_the_image_runs_as_a_numbered_user_that_is_not_root() -> None:
+    (user,) = values("USER")
+    assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", user)
+
+
+@pytest.mark.parametrize("instruction", ["ENTRYPOINT", "CMD", "HEALTHCHECK"])
+def test_signals_reach_the_service_because_no_shell_is_in_between(instruction: str) -> None:
+    (value,) = values(instruction)
+    assert isinstance(json.loads(value[value.index("[") :]), list)
+
+
+def test_what_the_image_is_built_from_is_there_and_not_ignored() -> None:
+    ignored = (ROOT / ".dockerignore").read_text().split()
+    for rest in values("COPY"):
+        if rest.startswith("--from"):
+            continue
+        for source in rest.split()[:-1]:
+            assert (ROOT / source).exists(), source
+            assert f"!{source}" in ignored
+
+
+@pytest.mark.parametrize("runtime", ["cpu", "gpu"])
+def test_the_image_needs_one_runtime_and_no_torch(runtime: str) -> None:
+    runs = [rest.split("/opt/lanestream ")[-1].split() for rest in values("RUN") if "dependencies.py" in rest]
+    (extras,) = [extras for extras in runs if runtime in extras]
+    needed = script("dependencies").requirements(ROOT / "pyproject.toml", extras)
+    names = [re.split(r"[\[<>=!~; ]", line)[0].lower() for line in needed]
+    assert len([name for name in names if name.startswith("onnxruntime")]) == 1
+    assert not {"torch", "torchvision", "lanestream"} & set(names)
+    assert {"fastapi", "uvicorn", "pydantic"} <= set(names)
+
+
+def test_an_extra_that_is_not_there_is_told() -> None:
+    with pytest.raises(KeyError, match="warp"):
+        script("dependencies").requirements(ROOT / "pyproject.toml", ["warp"])
+
+
+def test_what_is_never_imported_is_taken_out(tmp_path: Path) -> None:
+    gone = ["numpy/tests/test_x.py", "scipy/stats/tests/data/y.npy", "openvino/libs/libopenvino_intel_gpu_plugin.so"]
+    kept = ["numpy/testing/__init__.py", "numpy/core.py", "openvino/libs/libopenvino_intel_cpu_plugin.so"]
+    for name in [*gone, *kept]:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    script("dependencies").prune(tmp_path)
+    left = [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()]
+    assert sorted(left) == sorted(kept)
+
+
+def test_the_version_of_python_is_one_that_the_product_supports() -> None:
+    supported = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"].removeprefix(">=")
+    base = re.search(r"python:(\d+)\.(\d+)", values("ARG")[0])
+    assert base is not None
+    assert tuple(map(int, base.groups())) >= tuple(map(int, supported.split(".")))
+
+
+def test_what_the_page_about_deployment_points_to_is_there() -> None:
+    page = ROOT / "docs/deployment.md"
+    text = page.read_text()
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert (page.parent / target).exists(), target
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert set(re.findall(r"\bmake ([a-z-]+)(?= |`|$)", text)) <= set(targets)
+    assert {name.lower() for name in re.findall(r"LANESTREAM_([A-Z_]+)", text)} - {"publish"} <= set(
+        Settings.model_fields
+    )

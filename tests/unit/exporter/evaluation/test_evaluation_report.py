@@ -1,0 +1,207 @@
+"""A whole evaluation of rendered frames: models and peers, figures and their documentation, the report, the command."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lanestream.engine import load_engine
+from lanestream.errors import LabelError
+from lanestream.road.view import Image
+from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame
+from lanestream_exporter.datasets.splits import LabelledClip
+from lanestream_exporter.evaluation.baselines import HoughLinesPeer, SlidingWindowPeer
+from lanestream_exporter.evaluation.boundaries import match_ego
+from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, Material, evaluate
+from lanestream_exporter.evaluation.methods import Model, Peer
+from lanestream_exporter.evaluation.report import write_report
+from lanestream_exporter.evaluation.tables import tables
+from lanestream_exporter.evaluation_commands import evaluate as command
+from lanestream_exporter.scenes import Drive, render_still, sample_clip, write_clip
+
+DOCUMENT = Path(__file__).parents[4] / "docs" / "evaluation.md"
+PEERS = [HoughLinesPeer(), SlidingWindowPeer()]
+
+
+def still(seed: int, width: int = 640, height: int = 360) -> tuple[LabelledFrame, Image]:
+    rng = np.random.default_rng(seed)
+    drive = Drive("highway", fair=True)
+    rendered = render_still(sample_clip(rng, width, height, frames=1, fps=25.0, drive=drive).scene_at(0))
+    return rendered.labels, rendered.image
+
+
+def straight_road(width: int, height: int) -> Image:
+    """Two solid white lines on dark asphalt that meet at 45 % of the height."""
+    image = np.full((height, width, 3), 60, np.uint8)
+    horizon = 0.45 * height
+    for b in (-1.0, 1.0):
+        for y in range(int(horizon) + 2, height):
+            x, half = 0.5 * width + b * (y - horizon), 0.03 * (y - horizon) + 1.0
+            image[y, max(0, round(x - half)) : max(0, round(x + half) + 1)] = 235
+    return image
+
+
+@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: type(peer).__name__)
+@pytest.mark.parametrize(("width", "height"), [(640, 360), (1280, 720), (960, 540)])
+def test_peers_find_a_straight_road_at_any_size(peer: Any, width: int, height: int) -> None:
+    found = {boundary.position: boundary for boundary in peer.find(straight_road(width, height))}
+    assert set(found) == {-1, 1}
+    for side, boundary in found.items():
+        rows = np.linspace(boundary.top + 0.02 * height, 0.9 * height, 8)
+        expected = 0.5 * width + side * (rows - 0.45 * height)
+        np.testing.assert_allclose(boundary.curve.x(rows), expected, atol=0.012 * width)
+
+
+@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: type(peer).__name__)
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_peers_find_nothing_where_nothing_is(peer: Any, level: int) -> None:
+    assert peer.find(np.full((360, 640, 3), level, np.uint8)) == ()
+
+
+@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: type(peer).__name__)
+def test_peers_see_some_rendered_highways(peer: Any) -> None:
+    right = sum(len(match_ego(peer.find(image), frame).pairs) for frame, image in map(still, range(24, 34)))
+    assert right >= 4
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> LabelledClip:
+    folder = tmp_path_factory.mktemp("clip")
+    rng = np.random.default_rng(24)
+    made = sample_clip(rng, 320, 180, frames=8, fps=25.0, drive=Drive("highway", fair=True))
+    video, labels = folder / "road.mp4", folder / "road.jsonl"
+    write_clip(made, video, labels)
+    return LabelledClip("road", video, labels, range(1000), WHOLE)
+
+
+@pytest.fixture(scope="module")
+def evaluation(clip: LabelledClip) -> Evaluation:
+    frames = [still(seed) for seed in range(24, 28)]
+    methods = [Model(load_engine(provider="cpu")), *map(Peer, PEERS)]
+    return evaluate(methods, Material("rendered", lambda: iter(frames), (clip,)))
+
+
+@pytest.fixture(scope="module")
+def figures(evaluation: Evaluation) -> dict[str, Any]:
+    return evaluation.figures()
+
+
+def test_all_methods_see_the_same_frames(evaluation: Evaluation, figures: dict[str, Any]) -> None:
+    kinds = [method["kind"] for method in figures["methods"].values()]
+    guides = [method["guided_by"] for method in figures["methods"].values()]
+    assert guides[0].startswith("lanestream-regressor")
+    assert guides[1:] == [None, None]
+    assert kinds == ["classifier", "peer", "peer"]
+    for name, kind in zip(figures["methods"], kinds, strict=True):
+        part = figures["images"][name][OVERALL]
+        assert part["boundaries"]["ego"]["frames"] == part["field"]["tusimple"]["frames"] == 4
+        assert ("candidates" in part) == (kind == "classifier")
+        assert figures["clips"][name]["road"]["steadiness"]["frames"] == 8
+        tracked = figures["clips"][name]["road"]["tracked"]["ego"]
+        assert tracked["frames"] == figures["clips"][name]["road"]["alone"]["ego"]["frames"] == 8
+        assert tracked["right"] + tracked["missed"] == 16
+        peers_have_no_memory = figures["clips"][name]["road"]["alone"]["ego"]["right"] == tracked["right"]
+        assert peers_have_no_memory or kind != "peer"
+
+
+def test_the_same_frames_give_the_same_figures(evaluation: Evaluation, figures: dict[str, Any]) -> None:
+    assert json.dumps(evaluation.figures()) == json.dumps(figures)
+    assert "NaN" not in json.dumps(figures)
+
+
+def expanded(pattern: str) -> Iterator[str]:
+    """`a.{b,c}` as `a.b` and `a.c`."""
+    parts = [part.split(",") for part in re.split(r"[{}]", pattern)]
+    fixed = [[",".join(part)] if index % 2 == 0 else part for index, part in enumerate(parts)]
+    return map("".join, itertools.product(*fixed))
+
+
+def documented() -> set[str]:
+    """The keys of the tables, each below every base that the paragraph before its table names."""
+    text = DOCUMENT.read_text(encoding="utf-8")
+    keys: set[str] = set()
+    bases = [""]
+    for part in text[text.index("## The keys of the JSON file") :].split("\n\n"):
+        if part.startswith("|"):
+            cells = re.findall(r"^\| `([^`]+)` \|", part, flags=re.MULTILINE)
+            keys.update(key for base in bases for cell in cells for key in expanded(f"{base}.{cell}".lstrip(".")))
+        else:
+            bases = re.findall(r"`((?:images|clips)\.[^`]*)`", part) or [""]
+    return keys
+
+
+def written(value: Any, path: str = "") -> Iterator[str]:
+    if isinstance(value, dict):
+        names = {"methods": "<method>", "images": "<method>", "clips": "<method>"}
+        names |= {"images.<method>": "<drive>", "clips.<method>": "<clip>"}
+        for key, part in value.items():
+            yield from written(part, f"{path}.{names.get(path, key)}".lstrip("."))
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for part in value:
+            yield from written(part, f"{path}[]")
+    else:
+        yield path
+
+
+def test_the_documented_keys_are_the_written_ones(figures: dict[str, Any]) -> None:
+    assert sorted(documented()) == sorted(set(written(figures)))
+
+
+def test_the_report_stands_alone(evaluation: Evaluation, figures: dict[str, Any], tmp_path: Path) -> None:
+    page = write_report(tmp_path / "new" / "folder", evaluation, figures).read_text(encoding="utf-8")
+    assert page.count("<svg") == page.count("</svg>") == 5
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+    assert not re.findall(r"<script|@import", page)
+    for method in figures["methods"]:
+        assert method.replace("'", "&#39;") in page
+    identifiers = re.findall(r'\bid="([^"]+)"', page)
+    assert len(identifiers) == len(set(identifiers))
+    assert "None" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
+
+
+def test_the_worst_frames_come_first(evaluation: Evaluation, figures: dict[str, Any], tmp_path: Path) -> None:
+    page = write_report(tmp_path, evaluation, figures).read_text(encoding="utf-8")
+    mistakes = [
+        int(a) + int(b) for a, b in re.findall(r"<figcaption>[^<]*ego \d+ right, (\d+) wrong, (\d+) missed", page)
+    ]
+    assert len(mistakes) == 4
+    assert mistakes == sorted(mistakes, reverse=True)
+
+
+def test_the_tables_name_every_method_and_drive(figures: dict[str, Any]) -> None:
+    made = list(tables(figures))
+    drives = len(figures["images"][PEERS[0].name])
+    assert drives == 5
+    assert [table.row_count for table in made] == [2 * drives, 2 * drives, 4 * drives, 8, 8, *[4 * drives] * 3]
+
+
+def test_nothing_labelled_is_told() -> None:
+    with pytest.raises(LabelError, match="nothing is labelled in empty"):
+        evaluate([Peer(HoughLinesPeer())], Material("empty", lambda: ()))
+
+
+def test_the_command_measures_frames_of_ones_own(tmp_path: Path) -> None:
+    rows = list(range(300, 711, 10))
+    cv2.imwrite(str(tmp_path / "road.png"), straight_road(1280, 720))
+    lanes = [[int(640 + side * (row - 324)) if row > 340 else -2 for row in rows] for side in (-1, 1)]
+    record = {"raw_file": "road.png", "h_samples": rows, "lanes": lanes}
+    (tmp_path / "labels.json").write_text(json.dumps(record) + "\n")
+    path = tmp_path / "made" / "figures.json"
+    arguments = ["--data", str(tmp_path), "--format", "tusimple", "--json", str(path), "--out", str(tmp_path / "made")]
+    result = CliRunner().invoke(command, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    figures = json.loads(path.read_text())
+    assert figures["clips"] == {name: {} for name in figures["methods"]}
+    peer = figures["images"][PEERS[0].name][OVERALL]
+    assert (peer["boundaries"]["ego"]["right"], peer["boundaries"]["ego"]["missed"]) == (2, 0)
+    assert (tmp_path / "made" / "report.html").is_file()

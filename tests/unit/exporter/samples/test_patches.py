@@ -1,0 +1,156 @@
+"""What a candidate is called, and how boundaries are counted against labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lanestream.errors import LabelError
+from lanestream.road.curve import Curve
+from lanestream.road.results import Candidate
+from lanestream.road.view import RoadView
+from lanestream_exporter.datasets.clips import read_clip_labels
+from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
+from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
+from lanestream_exporter.samples.patch_store import read_stores, write_store
+from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE, TruthRule, fitted_candidate
+
+VIEW = RoadView(1280, 720, 300.0)
+
+
+def curve(b: float, v: float = 640.0) -> Curve:
+    return Curve(300.0, (v, b, 0.0))
+
+
+def label(b: float, top: float = 340.0, bottom: float = 700.0, position: int | None = None) -> LabelledLane:
+    rows = np.linspace(bottom, top, 30)
+    return LabelledLane(np.stack([curve(b).x(rows), rows], axis=1), position=position)
+
+
+def frame(*lanes: LabelledLane, coverage: Coverage = PARTIAL) -> LabelledFrame:
+    return LabelledFrame(1280, 720, lanes, "clip", "clip#0", coverage)
+
+
+def candidate(b: float, v: float = 640.0) -> Candidate:
+    return Candidate(curve(b, v), 342.0, 719.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("b", "v", "verdict"),
+    [
+        (-1.1, 640.0, TRUE),
+        (-1.1, 650.0, TRUE),
+        (-1.1, 668.0, UNSURE),
+        (0.0, 640.0, FALSE),
+        (2.5, 640.0, UNKNOWN),
+        (-2.5, 640.0, UNKNOWN),
+    ],
+)
+def test_verdicts(b: float, v: float, verdict: int) -> None:
+    rule, labels = TruthRule(), frame(label(-1.1), label(1.1))
+    assert rule.judge([candidate(b, v)], labels, VIEW).tolist() == [verdict]
+
+
+def test_beyond_the_labels_of_a_wholly_labelled_frame_a_candidate_is_false() -> None:
+    labels = frame(label(-1.1), label(1.1), coverage=WHOLE)
+    assert TruthRule().judge([candidate(2.5)], labels, VIEW).tolist() == [FALSE]
+
+
+@pytest.mark.parametrize(
+    ("coverage", "verdicts"),
+    [
+        (EGO_LANE, [UNKNOWN, UNKNOWN]),
+        (Coverage(open_sides=(1,)), [FALSE, UNKNOWN]),
+        (Coverage(open_sides=(-1,)), [UNKNOWN, FALSE]),
+    ],
+)
+def test_beyond_the_labels_a_candidate_is_unknown_where_the_side_is_open(
+    coverage: Coverage, verdicts: list[int]
+) -> None:
+    labels = frame(label(-1.1, position=-1), label(1.1, position=1), coverage=coverage)
+    assert TruthRule().judge([candidate(-2.5), candidate(2.5)], labels, VIEW).tolist() == verdicts
+    for b, verdict in zip((-2.5, 2.5), verdicts, strict=True):
+        tally = Tally()
+        count(tally, [found(b)], labels.lanes, labels)
+        assert tally.wrong == (verdict == FALSE)
+
+
+def test_beside_an_ego_boundary_that_is_absent_there_is_nothing() -> None:
+    labels = frame(label(1.1, position=1), coverage=EGO_LANE)
+    assert TruthRule().judge([candidate(-2.5), candidate(2.5)], labels, VIEW).tolist() == [FALSE, UNKNOWN]
+
+
+def test_a_short_overlap_is_not_enough_to_be_true() -> None:
+    short = Candidate(curve(-1.1), 600.0, 719.0, 1.0)
+    assert TruthRule().judge([short], frame(label(-1.1)), VIEW).tolist() == [UNSURE]
+
+
+def test_a_label_becomes_the_candidate_that_follows_it() -> None:
+    bent = Curve(300.0, (640.0, -1.1, 4000.0))
+    rows = np.linspace(700.0, 340.0, 30)
+    fitted = fitted_candidate(LabelledLane(np.stack([bent.x(rows), rows], axis=1)), VIEW)
+    assert fitted is not None
+    np.testing.assert_allclose(fitted.curve.x(rows), bent.x(rows), atol=0.01)
+
+
+def found(b: float, v: float = 640.0, top: float = 342.0, position: int = -1) -> Found:
+    return Found(curve(b, v), top, 719.0, position)
+
+
+def test_boundaries_are_matched_one_to_one() -> None:
+    tally = Tally()
+    count(tally, [found(-1.1), found(-1.1, 635.0)], [label(-1.1)], frame(label(-1.1), label(1.1)))
+    assert (tally.right, tally.wrong, tally.missed) == (1, 1, 0)  # the second repeats the outermost label
+    tally = Tally()
+    count(tally, [found(-1.1), found(-3.3)], [label(-1.1)], frame(label(-1.1), label(1.1)))
+    assert (tally.right, tally.wrong, tally.missed) == (1, 0, 0)  # the second lies beyond it: nobody knows
+    tally = Tally()
+    count(tally, [found(-1.1), found(-1.1, 645.0)], [label(-1.1)], frame(label(-1.1), coverage=WHOLE))
+    assert (tally.right, tally.wrong, tally.missed) == (1, 1, 0)
+    assert tally.errors == pytest.approx([0.0], abs=1e-9)
+
+
+def test_far_off_or_short_ones_are_wrong_and_the_label_is_missed() -> None:
+    for wrong in (found(-1.1, 700.0), found(-1.1, top=600.0)):
+        tally = Tally()
+        count(tally, [wrong], [label(-1.1)], frame(label(-1.1), coverage=WHOLE))
+        assert (tally.right, tally.wrong, tally.missed) == (0, 1, 1)
+
+
+def test_errors_are_told_at_640_pixels_of_width() -> None:
+    tally = Tally()
+    count(tally, [found(0.0, 650.0)], [label(0.0)], frame(label(0.0), coverage=WHOLE))
+    assert tally.mean_error == pytest.approx(5.0)
+
+
+def test_ego_labels_are_the_nearest_beside_the_camera_where_they_have_no_names() -> None:
+    lanes = [label(-3.3), label(-1.1), label(1.1), label(3.3, bottom=450.0)]
+    assert ego_labels(frame(*lanes)) == lanes[1:3]
+    named = [label(-3.3, position=-1), label(-1.1, position=2)]
+    assert ego_labels(frame(*named)) == named[:1]
+
+
+def test_a_bad_label_record_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "clip.jsonl"
+    path.write_text('{"frame": 0, "width": 10, "height": 10, "lanes": []}\n{"frame": 1}\n')
+    with pytest.raises(LabelError, match=r"clip\.jsonl:2: .*lanes|width"):
+        read_clip_labels(path)
+
+
+def test_patches_survive_the_store(tmp_path: Path) -> None:
+    patches = [np.full((224, 224, 3), (200, 20, level), np.uint8) for level in (0, 100, 200)]
+    for name, labels in (("a", [0, 1]), ("b", [1])):
+        write_store(tmp_path / f"{name}.npz", zip(patches[-len(labels) :], labels, strict=True))
+    store = read_stores([tmp_path / "a.npz", tmp_path / "b.npz"])
+    assert store.labels.tolist() == [0, 1, 1]
+    for index, expected in enumerate((patches[1], patches[2], patches[2])):
+        np.testing.assert_allclose(store.patch(index), expected, atol=6)
+
+
+def test_a_broken_store_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "broken.npz"
+    path.write_text("no patches")
+    with pytest.raises(LabelError, match=r"broken\.npz"):
+        read_stores([path])
