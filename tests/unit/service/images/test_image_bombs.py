@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lanestream import imaging
 from lanestream.errors import ImageError
+from lanestream.images import decoding
 from lanestream.images.decoding import ImageLimits, decode
 
 LIMITS = ImageLimits()
@@ -38,7 +38,7 @@ def test_a_bomb_is_refused_or_goes_off_unheard(name: str) -> None:
 @pytest.mark.parametrize("name", bombs.BOMBS.keys() - DECODED_TO_BE_REFUSED)
 def test_no_decoder_sees_what_is_refused_or_what_inflates(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    monkeypatch.setattr(imaging.cv2, "imdecode", lambda file, flags: seen.append(file.size))
+    monkeypatch.setattr(decoding.cv2, "imdecode", lambda file, flags: seen.append(file.size))
     make, why = bombs.BOMBS[name]
     with pytest.raises(ImageError):
         decode(make(), LIMITS)
@@ -61,7 +61,7 @@ def test_the_usual_bomb_is_the_one_that_is_spoken_of() -> None:
 
 
 def test_another_image_than_the_one_that_was_checked_is_not_given_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imaging.cv2, "imdecode", lambda file, flags: np.zeros((180, 321, 3), np.uint8))
+    monkeypatch.setattr(decoding.cv2, "imdecode", lambda file, flags: np.zeros((180, 321, 3), np.uint8))
     with pytest.raises(ImageError, match="is corrupt"):
         decode(fakes.image_file(), LIMITS)
 
