@@ -1,128 +1,115 @@
-"""The whole way of a frame in one place: detectors, their networks, and the steps between image and result."""
+"""The engine of a process: its loaded models, and the detectors that use them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from lanestream.detection import Detector, Network, Pipeline, chosen, in_one
-from lanestream.detection.candidate_detector import CandidateDetector
-from lanestream.detection.ego_prior import EgoPriorEstimator
-from lanestream.detection.patches import PatchCutter, PatchGeometry
-from lanestream.detection.regression_detector import RegressionDetector, RoadCropGeometry
-from lanestream.errors import ModelError
-from lanestream.inference import ClassifierInfo, LoadedModel, RegressorInfo, load_model
-from lanestream.protocol import DetectorName
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.detection.detectors import DETECTORS, ModelDescriptions
+from lanestream.detection.interface import Detector, ModelRole
+from lanestream.errors import ModelError, NoDetectorError
+from lanestream.inference.loaded_model import LoadedModel
+from lanestream.inference.loading import load_model
+from lanestream.inference.model_info import ClassifierInfo, RegressorInfo
+from lanestream.inference.providers import AUTO, DEFAULT_OPTIONS, RuntimeOptions
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image
-from lanestream.runtime import DEFAULT_OPTIONS, Provider, RuntimeOptions
 from lanestream.session import Session
-from lanestream.workers.walk import FrameWalk
 
-# The networks that are shipped, and served where no others are named.
+# The shipped networks, which are the default.
 SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
 SHIPPED_REGRESSOR: Final = Path(__file__).parent / "models" / "regressor.onnx"
 
 
+@dataclass(frozen=True)
 class Engine:
-    """Detectors with their loaded networks, shared by all sessions of a process; the first one is the default."""
+    """The models of a process by their roles and the detectors by their names, shared by all its sessions.
 
-    def __init__(self, pipelines: Sequence[Pipeline]) -> None:
-        self.pipelines = tuple(pipelines)
+    `main_roles` says which model a detector cannot do without. The first detector is the default.
+    """
 
-    @property
-    def detector(self) -> Detector:
-        """The default detector."""
-        return self.pipelines[0].detector
+    models: Mapping[ModelRole, LoadedModel]
+    detectors: Mapping[str, Detector]
+    main_roles: Mapping[str, ModelRole]
 
-    @property
-    def network(self) -> Network:
-        """The default detector's network."""
-        return self.pipelines[0].network
+    @classmethod
+    def of(cls, models: Mapping[ModelRole, LoadedModel]) -> Engine:
+        """Returns the engine with every detector that the `models` allow."""
+        infos = {role: model.info for role, model in models.items()}
+        classifier, regressor = infos.get("classifier"), infos.get("regressor")
+        descriptions = ModelDescriptions(
+            classifier if isinstance(classifier, ClassifierInfo) else None,
+            regressor if isinstance(regressor, RegressorInfo) else None,
+        )
+        built = {spec.name: spec.build(descriptions) for spec in DETECTORS}
+        detectors = {name: detector for name, detector in built.items() if detector is not None}
+        return cls(models, detectors, {spec.name: spec.model for spec in DETECTORS if spec.name in detectors})
 
-    def pipeline(self, name: DetectorName | None = None) -> Pipeline:
-        """The pipeline of that name, the default one where None. Raises NoDetectorError where it is not loaded."""
-        return chosen({pipeline.name: pipeline for pipeline in self.pipelines}, name)
+    def select(self, name: str | None = None) -> str:
+        """Returns the name of the detector `name`, or of the default one. Raises NoDetectorError if it is missing."""
+        if name is None:
+            return next(iter(self.detectors))
+        if name not in self.detectors:
+            raise NoDetectorError(f"there is no detector {name} here", f"ask for {', '.join(self.detectors)}")
+        return name
 
-    def open_session(self, horizon: float | None = None, detector: DetectorName | None = None) -> Session:
-        """A session for one camera; `horizon` is its row as a share of the image height, estimated where None.
+    def main_model(self, detector: str | None = None) -> LoadedModel:
+        """Returns the model that the `detector`, or the default one, cannot do without. Raises NoDetectorError."""
+        return self.models[self.main_roles[self.select(detector)]]
 
-        Raises NoDetectorError where `detector` is not loaded.
+    def open_session(self, horizon: float | None = None, detector: str | None = None) -> Session:
+        """Returns a session for one camera; `horizon` is its row as a share of the image height, estimated if None.
+
+        Raises NoDetectorError if `detector` is not loaded.
         """
-        return Session(self.pipeline(detector), horizon)
+        return Session(self.detectors[self.select(detector)], horizon)
 
     def process(self, session: Session, image: Image, timestamp: float) -> FrameResult:
-        """One frame from image to lanes, in the calling thread, with the milliseconds of each stage."""
-        walk = FrameWalk(in_one(session.follow(image, timestamp)))
-        question = walk.go()
-        inferring = 0.0
-        while question is not None:
+        """Processes one frame in the calling thread, with the milliseconds of each stage in the result's timing."""
+        infer_s = 0.0
+
+        def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+            nonlocal infer_s
             started = time.perf_counter()
-            answer = question.network.run(question.inputs)
-            inferring += time.perf_counter() - started
-            question = walk.go(answer)
-        return replace(walk.result, timing_ms={**walk.timing_ms, "infer": 1e3 * inferring})
+            outputs = self.models[role].run(inputs)
+            infer_s += time.perf_counter() - started
+            return outputs
+
+        result = session.process(image, timestamp, infer)
+        return replace(result, timing_ms={**result.timing_ms, "infer": 1e3 * infer_s})
 
 
 def load_engine(
     model: Path | None = None,
-    provider: Provider = "auto",
+    provider: str = AUTO,
     regressor: Path | None = SHIPPED_REGRESSOR,
     options: RuntimeOptions = DEFAULT_OPTIONS,
 ) -> Engine:
-    """The engine for the model file at `model`, the shipped classifier where None, warmed up.
+    """Loads the model file at `model`, by default the shipped classifier, and warms it up.
 
-    A classifier is helped by the `regressor`, which tells it where to look and is a detector of its own; None goes
-    without. A regressor as the `model` is the only detector. Raises ModelError for a file that can't be served,
-    ProviderError where `provider` can't be had.
+    A classifier works with the `regressor`, which shows it where to search and is a detector itself; None leaves it out.
+    A regressor as the `model` is the only detector. Raises ModelError for a file that cannot be served, ProviderError if
+    `provider` cannot be used.
     """
-    network = _warm(model or SHIPPED_MODEL, provider, options)
-    if isinstance(network.info, RegressorInfo):
-        return Engine([_whole_frames(_regression(network.info), network)])
-    if regressor is None:
-        return Engine([Pipeline("candidates", _candidates(network.info), network)])
-    other = _warm(regressor, provider, options)
-    if not isinstance(other.info, RegressorInfo):
-        raise ModelError(f"{regressor} is a {other.info.kind}, not a regressor", "give a regressor, or `none`")
-    regression = _regression(other.info)
-    glance = EgoPriorEstimator(regression, other)
-    return Engine(
-        [
-            Pipeline("candidates", _candidates(network.info), network, glance),
-            _whole_frames(regression, other),
-        ]
-    )
+    main = load_model(model or SHIPPED_MODEL, provider, options)
+    models: dict[ModelRole, LoadedModel] = {main.info.kind: main}
+    if main.info.kind == "classifier" and regressor is not None:
+        models["regressor"] = load_model(regressor, provider, options)
+        if not isinstance(models["regressor"].info, RegressorInfo):
+            raise ModelError(f"{regressor} is a {models['regressor'].info.kind}, not a regressor", "give one, or `none`")
+    for loaded in models.values():
+        loaded.warm_up()
+    return Engine.of(models)
 
 
-def resolve_regressor(named: Path | None) -> Path | None:
-    """The file that users mean by `named`: the default one where they name none, and no file by the name `none`."""
-    if named is None:
+def resolve_regressor(path: Path | None) -> Path | None:
+    """Returns the regressor's file that a user's setting means: the shipped one if None, None for the path `none`."""
+    if path is None:
         return SHIPPED_REGRESSOR
-    return None if named == Path("none") else named
-
-
-def _warm(path: Path, provider: Provider, options: RuntimeOptions) -> LoadedModel:
-    network = load_model(path, provider, options)
-    network.warm_up()
-    return network
-
-
-def _whole_frames(detector: RegressionDetector, network: Network) -> Pipeline:
-    """The detector that needs one look; a frame whose horizon it does not know it looks at once more, closely."""
-    return Pipeline("regression", detector, network, first_look=EgoPriorEstimator(detector, network))
-
-
-def _candidates(info: ClassifierInfo) -> CandidateDetector:
-    """The detector that asks a classifier about the strips it was trained on."""
-    strip = PatchGeometry(info.strip.size, info.strip.half_width, info.strip.min_half_width, info.strip.lean)
-    return CandidateDetector(info.threshold, cutter=PatchCutter(strip))
-
-
-def _regression(info: RegressorInfo) -> RegressionDetector:
-    """The detector that shows a regressor the canvases it was trained on."""
-    canvas = info.canvas
-    geometry = RoadCropGeometry(canvas.size, canvas.above, canvas.narrowest)
-    return RegressionDetector(info.threshold, geometry, canvas.detail_width)
+    return None if path == Path("none") else path

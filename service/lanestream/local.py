@@ -1,26 +1,25 @@
-"""The engine in this process, for those who want lanes without a service: images in, the service's messages out."""
+"""The engine in this process, for users who want lanes without a service: images in, the service's messages out."""
 
 from __future__ import annotations
 
 import time
 from typing import TYPE_CHECKING, Final
 
-from lanestream.detection.features import WORKING_WIDTH
 from lanestream.engine import load_engine, resolve_regressor
 from lanestream.images.decoding import MOST_PIXELS, ImageLimits, Picture, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
+from lanestream.road.view import WORKING_WIDTH
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lanestream.detection import Network
     from lanestream.engine import Engine
-    from lanestream.protocol import CameraModel, DetectorName, LanesMessage
+    from lanestream.inference.loaded_model import LoadedModel
+    from lanestream.protocol import CameraModel, LanesMessage
     from lanestream.road.view import Image
-    from lanestream.runtime import Provider
     from lanestream.session import Session
 
-# Who decodes a file of their own may give it more memory than a service gives to strangers.
+# A user's own files may take more memory than a service gives to strangers.
 _LIMITS: Final = ImageLimits(max_bytes=1 << 28, max_pixels=MOST_PIXELS)
 
 
@@ -31,23 +30,23 @@ class LocalEngine:
         self._engine = engine
 
     @classmethod
-    def load(cls, model: Path | None, provider: Provider, regressor: Path | None = None) -> LocalEngine:
-        """The engine for a model file and the regressor beside it, the shipped ones where None.
+    def load(cls, model: Path | None, provider: str, regressor: Path | None = None) -> LocalEngine:
+        """Loads a model file and the regressor, by default the shipped ones; the path `none` leaves the regressor out.
 
-        The path `none` goes without a regressor. Raises ModelError and ProviderError.
+        Raises ModelError and ProviderError.
         """
         return cls(load_engine(model, provider, resolve_regressor(regressor)))
 
-    def network(self, detector: DetectorName | None = None) -> Network:
-        """The network of a detector, of the default one where None. Raises NoDetectorError where it is not loaded."""
-        return self._engine.pipeline(detector).network
+    def network(self, detector: str | None = None) -> LoadedModel:
+        """Returns the main model of a detector, by default of the default one. Raises NoDetectorError."""
+        return self._engine.main_model(detector)
 
     def open_camera(
-        self, horizon: float | None = None, detector: DetectorName | None = None, camera: CameraModel | None = None
+        self, horizon: float | None = None, detector: str | None = None, camera: CameraModel | None = None
     ) -> LocalCamera:
-        """Lanes for the frames of one camera; `horizon` as a share of the image height, estimated where None.
+        """Returns one camera's session; `horizon` is a share of the image height, estimated if None.
 
-        With a `camera` lanes are told in metres too. Raises NoDetectorError where `detector` is not loaded.
+        With a `camera` lanes are reported in meters too. Raises NoDetectorError if `detector` is not loaded.
         """
         return LocalCamera(self._engine, self._engine.open_session(horizon, detector), camera)
 
@@ -61,9 +60,9 @@ class LocalCamera:
         self._model = model
 
     def lanes(self, image: bytes | Image, *, seq: int, timestamp: float) -> LanesMessage:
-        """The lanes of one frame: an image file, or BGR pixels (H, W, 3) uint8; `timestamp` in seconds.
+        """Returns the lanes of one frame: an image file, or BGR pixels (H, W, 3) uint8; `timestamp` in seconds.
 
-        Raises ImageError where the file can't be decoded; the session is then as it was before.
+        Raises ImageError if the file cannot be decoded, and leaves the session as it was.
         """
         started = time.perf_counter()
         picture = decode_reduced(image, _LIMITS, WORKING_WIDTH) if isinstance(image, bytes) else Picture(image)

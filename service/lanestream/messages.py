@@ -20,8 +20,7 @@ from lanestream.protocol import (
     TimingModel,
 )
 from lanestream.road.camera import Camera
-from lanestream.road.curve import curve_columns
-from lanestream.road.view import Scaling
+from lanestream.road.curve import Curves
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,10 +49,7 @@ class ProcessedFrame:
     @classmethod
     def of(cls, picture: Picture, result: FrameResult, timing_ms: dict[str, float]) -> ProcessedFrame:
         """From the `result` in pixels of the decoded image."""
-        scaling = picture.scaling
-        lanes = tuple(_in_image(lane, scaling) for lane in result.lanes)
-        horizon = scaling.to_image(result.horizon)
-        return cls(picture.size, replace(result, lanes=lanes, horizon=horizon, timing_ms=timing_ms))
+        return cls(picture.size, replace(result.to_image(picture.scaling), timing_ms=timing_ms))
 
 
 def lanes_message(
@@ -77,16 +73,6 @@ def lanes_message(
         events=[LaneChangeModel(track_id=event.track_id, direction=event.direction) for event in result.events],
         dropped=dropped,
         timing_ms=TimingModel(**{stage: round(ms, 3) for stage, ms in result.timing_ms.items()}),
-    )
-
-
-def _in_image(lane: LaneBoundary, scaling: Scaling) -> LaneBoundary:
-    return replace(
-        lane,
-        curve=scaling.curve_to_image(lane.curve),
-        covariance=scaling.covariance_to_image(lane.covariance),
-        top=scaling.to_image(lane.top),
-        bottom=scaling.to_image(lane.bottom),
     )
 
 
@@ -118,10 +104,12 @@ def _rounded(values: Ground, decimals: tuple[int, int, int]) -> Ground:
 
 def _points(lanes: Sequence[LaneBoundary]) -> list[list[Point]]:
     """The points of each lane, from its lowest row to its highest."""
-    ends = np.array([(lane.bottom, lane.top) for lane in lanes]).reshape(-1, 2)
+    if not lanes:
+        return []
+    ends = np.array([(lane.bottom, lane.top) for lane in lanes])
     # Rounded rows first, so that the points are on the curve.
     rows = np.linspace(ends[:, 0], ends[:, 1], _POINTS, axis=1).round(2)
-    columns = curve_columns([lane.curve for lane in lanes], rows).round(2)
+    columns = Curves.of([lane.curve for lane in lanes]).x(rows).round(2)
     return [[(x, y) for x, y in lane] for lane in np.stack([columns, rows], axis=-1).tolist()]
 
 

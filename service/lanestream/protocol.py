@@ -177,6 +177,7 @@ class TimingModel(Message):
     propose: float
     queue: float
     infer: float
+    fit: float = 0.0
     track: float
     total: float
 

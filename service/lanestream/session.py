@@ -1,111 +1,128 @@
-"""One camera's memory: its tracker and its horizon."""
+"""One camera: detect, then track. Its state is a small value."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Detections, Network, Pipeline, Prepared, Question, Steps
+from lanestream.detection.interface import Detections, Detector, FrameContext, Infer, ModelRole
+from lanestream.images.resizing import working_image
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image
-from lanestream.tracking import LaneTracker
 from lanestream.tracking.state import TrackerState
+from lanestream.tracking.tracker import LaneTracker
 
-# The least that a new frame's horizon counts for the camera's: bumps should not move it, a minute of driving should.
-_HORIZON_GAIN = 0.1
+# The least weight of a new frame's horizon: bumps should not move the camera's, a minute of driving should.
+_HORIZON_GAIN: Final = 0.1
 
 
 @dataclass(frozen=True)
 class SessionState:
     """What a session remembers, as a small value.
 
-    That is the size (width, height) of its frames, its horizon and the one that was last seen at a glance (both as
-    shares of the height), and its tracker.
+    `size` is the width and height of its working images, `horizon` the camera's and `prior_horizon` the one that the
+    ego-lane prior saw in the last frame, both as shares of the height. `evidence` is how much the frames have said about
+    the horizon.
     """
 
-    size: tuple[int, int] | None
-    horizon: float | None
-    glanced: float | None
-    evidence: float
-    tracker: TrackerState
+    size: tuple[int, int] | None = None
+    horizon: float | None = None
+    prior_horizon: float | None = None
+    evidence: float = 0.0
+    tracker: TrackerState = field(default_factory=TrackerState)
 
 
 class Session:
-    """Follows the lanes of one camera, frame by frame.
+    """Tracks the lanes of one camera, frame by frame.
 
-    `horizon` is its row as a share of the image height where the caller knows it; otherwise it is estimated from the
-    frames and steadied over time. A frame of another size than the last one starts the tracker afresh. `network` is
-    what answers between the two halves of a frame.
+    `horizon` is its row as a share of the image height, if the caller knows it; otherwise it is estimated from the frames
+    and smoothed over time. A frame of another size than the last one resets the tracker.
     """
 
-    def __init__(self, pipeline: Pipeline, horizon: float | None = None) -> None:
-        self._pipeline = pipeline
-        self.network: Network = pipeline.network
+    def __init__(self, detector: Detector, horizon: float | None = None) -> None:
+        self._detector = detector
         self._configured = horizon
-        self._estimate: float | None = None
-        self._glanced: float | None = None
-        self._evidence = 0.0
         self._size: tuple[int, int] | None = None
+        self._horizon: float | None = None
+        self._prior_horizon: float | None = None
+        self._evidence = 0.0
         self._tracker = LaneTracker()
 
     @property
     def state(self) -> SessionState:
-        """All that it remembers. Not to be asked for while a frame is being concluded."""
-        return SessionState(self._size, self._estimate, self._glanced, self._evidence, self._tracker.state)
+        """Everything it remembers. Do not read it while a frame is being processed."""
+        return SessionState(self._size, self._horizon, self._prior_horizon, self._evidence, self._tracker.state)
 
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
-        """Goes on where `state` was taken; `ids_lost` as for `LaneTracker.restored`. Raises ValueError for a bad one.
+        """Continues where `state` was taken; `ids_lost` more track ids count as assigned.
 
-        The session is then as it was before.
+        Raises ValueError for an invalid state, and leaves the session as it was.
         """
         self._tracker = LaneTracker.restored(state.tracker, ids_lost)
-        self._size, self._estimate, self._evidence = state.size, state.horizon, state.evidence
-        self._glanced = state.glanced
+        self._size, self._horizon, self._evidence = state.size, state.horizon, state.evidence
+        self._prior_horizon = state.prior_horizon
 
-    def follow(self, image: Image, timestamp: float) -> Steps[FrameResult]:
-        """One frame of the camera, from a BGR image (H, W, 3) uint8 to its lanes; `timestamp` as for `conclude`.
+    def process(self, image: Image, timestamp: float, infer: Infer) -> FrameResult:
+        """Returns the lanes of one frame, a BGR image (H, W, 3) uint8, in its pixels.
 
-        The session is left as it was until the last answer has come.
+        `timestamp` is the capture time in seconds; frames of a session are processed one at a time, in order. The
+        result's timing has the milliseconds of `propose` (without waiting for `infer`), `fit` and `track`. If `infer`
+        raises, the session stays as it was.
         """
-        prepared = yield from self.prepare(image)
-        *first, last = prepared.parts
-        for part in first:
-            yield Question(self.network, part(), waits=False)
-        outputs = yield Question(self.network, last())
-        return self.conclude(prepared, outputs, timestamp)
+        started = time.perf_counter()
+        working, scaling = working_image(image)
+        inference = _TimedInference(infer)
+        detections = self._detector.detect(working, self._context(working), inference)
+        detected = time.perf_counter()
+        self._update_horizon(detections)
+        result = self._tracker.update(detections.boundaries, timestamp, detections.view).to_image(scaling)
+        result.timing_ms.update(
+            propose=1e3 * (detected - started - inference.waited_s - detections.fit_s),
+            fit=1e3 * detections.fit_s,
+            track=1e3 * (time.perf_counter() - detected),
+        )
+        return result
 
-    def prepare(self, image: Image) -> Steps[Prepared]:
-        """The first half of a frame: network inputs from a BGR image (H, W, 3) uint8. Leaves the session as it is."""
-        height = image.shape[0]
-        share = self._configured if self._configured is not None else self._estimate
-        known = self._size == (image.shape[1], height)
-        return self._pipeline.prepare(
-            image,
-            horizon=None if share is None else share * height,
-            expected=self._tracker.curves if known else (),
-            glanced=None if self._glanced is None or not known else self._glanced * height,
+    def _context(self, working: Image) -> FrameContext:
+        height, width = working.shape[:2]
+        is_known = self._size == (width, height)
+        horizon = self._horizon if self._configured is None else self._configured
+        return FrameContext(
+            horizon=None if horizon is None else horizon * height,
+            tracked=self._tracker.curves if is_known else None,
+            prior_horizon=None if self._prior_horizon is None or not is_known else self._prior_horizon * height,
         )
 
-    def conclude(self, prepared: Prepared, outputs: NDArray[np.float32], timestamp: float) -> FrameResult:
-        """The second half: detections from the network's outputs, then one step of the tracker.
-
-        `timestamp` is the capture time in seconds. Frames of a session are concluded one at a time, in order.
-        """
-        view = prepared.view
-        findings = self._pipeline.detector.finish(prepared, outputs)
-        if self._size not in (None, (view.width, view.height)):
+    def _update_horizon(self, detections: Detections) -> None:
+        """Updates the horizon by a weighted mean of what the frames say that forgets slowly."""
+        view = detections.view
+        size = view.width, view.height
+        if self._size not in (None, size):
             self._tracker = LaneTracker()
-            self._estimate, self._evidence = None, 0.0
-        self._size = (view.width, view.height)
-        self._glanced = None if prepared.prior is None else prepared.prior.view.horizon / view.height
-        self._steady_horizon(findings)
-        return self._tracker.update(findings.detections, timestamp, findings.view)
+            self._horizon, self._evidence = None, 0.0
+        self._size = size
+        prior_horizon = detections.prior_horizon
+        self._prior_horizon = None if prior_horizon is None else prior_horizon / view.height
+        share, weight = view.horizon / view.height, detections.horizon_weight
+        self._evidence += weight
+        gain = max(_HORIZON_GAIN * weight, weight / max(self._evidence, 1e-6))
+        self._horizon = share if self._horizon is None else self._horizon + gain * (share - self._horizon)
 
-    def _steady_horizon(self, findings: Detections) -> None:
-        """A mean of what the frames say, weighed by how much they have to say, that forgets slowly."""
-        share = findings.view.horizon / findings.view.height
-        self._evidence += findings.horizon_weight
-        gain = max(_HORIZON_GAIN * findings.horizon_weight, findings.horizon_weight / max(self._evidence, 1e-6))
-        self._estimate = share if self._estimate is None else self._estimate + gain * (share - self._estimate)
+
+class _TimedInference:
+    """Calls `infer`, and adds up the seconds that the calls take."""
+
+    def __init__(self, infer: Infer) -> None:
+        self._infer = infer
+        self.waited_s = 0.0
+
+    def __call__(self, role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        started = time.perf_counter()
+        try:
+            return self._infer(role, inputs)
+        finally:
+            self.waited_s += time.perf_counter() - started

@@ -1,144 +1,146 @@
-"""The default detector: candidates, a patch for each, the classifier's word, refinement of what it accepts."""
+"""The candidate detector: many proposals, a patch of each for the classifier, and a fit of those it accepts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Detections, Prepared
-from lanestream.detection.bars import USUAL_LEANING
-from lanestream.detection.curve_fit import Refinement
-from lanestream.detection.ego_prior import EgoPrior
-from lanestream.detection.patches import PatchCutter
-from lanestream.detection.proposals import TOP_SHARE, CandidateSearch, Survey
-from lanestream.road.curve import Curve, FloatArray, curve_columns, curves_through
-from lanestream.road.results import Candidate, Detection
+from lanestream.detection.curve_fit import fit_curves
+from lanestream.detection.interface import Detections, FrameContext, Infer
+from lanestream.detection.ego_prior import RoadRegressor
+from lanestream.detection.features import paint_gray
+from lanestream.detection.patches import cut_patches
+from lanestream.detection.proposals import (
+    MOST_CANDIDATES,
+    Proposals,
+    are_duplicates,
+    non_maximum_suppression,
+    propose,
+)
+from lanestream.detection.regression_detector import fit_output
+from lanestream.road.crops import PatchGeometry
+from lanestream.road.curve import ANCHORS, Curves, FloatArray
+from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_spans
 
-TRUE_LANE = 1
+# The column of the classifier's outputs that holds the probability of a boundary.
+BOUNDARY: Final = 1
 
-# The shares of the depth at which curves are averaged: three tell a curve.
-_ROWS: Final = (1.0, 0.45, 0.15)
+# At these shares of the depth distances between candidates are compared.
+_COMPARED: Final = np.array([0.25, 0.5, 1.0])
+# Candidates that are nowhere farther apart than the first, in row offsets, follow the same marking; the position of a
+# marking is the mean of those that are nowhere farther apart than the second, measured across the line.
+_SAME: Final = 0.12
+_AVERAGED: Final = 0.25
+# hypot(1, slope) of an ego boundary, see `curve_fit`.
+_USUAL_OBLIQUITY: Final = 1.6
+# Of two boundaries that come closer than this, in row offsets, or that cross, one is wrong.
+_CLOSEST: Final = 0.8
 
 
 @dataclass(frozen=True)
 class CandidateDetector:
-    """Finds boundaries by proposing many and letting the classifier choose.
+    """Accepts candidates from the probability `threshold` on; a `regressor`, if any, shows where to search."""
 
-    A candidate is accepted from the probability `threshold` on. Candidates that are nowhere more than `same` times the
-    rows below the horizon apart follow the same marking, and those that are nowhere more than `alike` apart, across the
-    line, tell together where it runs. Of two boundaries that come nearer than `separation`, or that cross, one is
-    wrong: the more probable one stays.
-    """
+    threshold: float
+    patch: PatchGeometry = PatchGeometry()
+    regressor: RoadRegressor | None = None
 
-    threshold: float = 0.5
-    search: CandidateSearch = CandidateSearch()
-    cutter: PatchCutter = PatchCutter()
-    refinement: Refinement = Refinement()
-    same: float = 0.12
-    alike: float = 0.25
-    separation: float = 0.8
+    def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
+        """Returns the boundaries in a BGR working image (H, 640, 3) uint8."""
+        gray = paint_gray(image)
+        proposals = self.propose(image, gray, context, infer)
+        patches = cut_patches(image, proposals.curves, proposals.spans, proposals.view, self.patch)
+        outputs = infer("classifier", patches)
+        return self.decide(gray, proposals, outputs)
 
-    def survey(self, image: Image, horizon: float | None = None) -> Survey:
-        """What can be seen of a BGR image (H, W, 3) before there is a prior; `horizon` as for `prepare`."""
-        return self.search.survey(image, horizon)
-
-    def prepare(
-        self,
-        image: Image,
-        horizon: float | None = None,
-        expected: Sequence[Curve] = (),
-        prior: EgoPrior | None = None,
-        survey: Survey | None = None,
-    ) -> Prepared:
-        """Patches of the candidates of a BGR image (H, W, 3) uint8; `horizon` is about its row, where known.
-
-        A `prior` tells where to look; without one, edges and ridges alone do. `survey` is what `survey` found.
-        """
-        proposals = self.search.propose(image, horizon, expected, prior, survey)
-        patches = self.cutter.parts(image, proposals.candidates, proposals.view)
-        return Prepared(image, patches, proposals.view, proposals.candidates, proposals.weight)
-
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Detections:
-        """Detections from the classifier's probabilities (N, 2) for the patches of `prepare`, left to right.
-
-        A glance's word on their places decides with the classifier's which candidates are accepted. Where exactly a
-        line runs the patches tell better.
-        """
-        told = outputs[:, TRUE_LANE].astype(np.float64)
-        probability = self.judged(prepared, outputs)
-        order = np.argsort(-told, kind="stable")
-        accepted = order[probability[order] >= self.threshold]
-        candidates = [prepared.candidates[i] for i in accepted]
-        if not candidates:
-            return Detections((), prepared.view, prepared.horizon_weight)
-        away = np.abs(_gaps([candidate.curve for candidate in candidates], prepared.view)).max(axis=2)
-        chosen = _kept(away > self.same)
-        together = self._together(candidates, told[accepted], away, chosen, prepared.view)
-        fits, view = self.refinement.refine(prepared.image, together, prepared.view)
-        spans = visible_spans([fit.curve for fit in fits], view, TOP_SHARE)
-        detections = [
-            Detection(fit.curve, fit.covariance, *span, float(probability[accepted[i]]))
-            for i, fit, span in zip(chosen, fits, spans, strict=True)
-            if span is not None
-        ]
-        detections.sort(key=lambda detection: -detection.probability)
-        return Detections(tuple(self._apart(detections, view)), view, prepared.horizon_weight)
+    def propose(
+        self, image: Image, gray: Image, context: FrameContext, infer: Infer, limit: int = MOST_CANDIDATES
+    ) -> Proposals:
+        """Returns the candidates of a BGR working image, whose paint is bright in `gray`."""
+        if self.regressor is None:
+            return propose(gray, context, None, None, limit)
+        horizon = context.horizon if context.prior_horizon is None else context.prior_horizon
+        output, view = self.regressor.predict(image, horizon, infer)
+        prior = self.regressor.prior(output, view)
+        # Tracked boundaries are on the paint already.
+        curves = output.curves(view)
+        tracked = (context.tracked or Curves.none(view.horizon)).below(view.horizon, view.bottom)
+        is_new = ~are_duplicates(curves, tracked, view).any(axis=1)
+        _, fits = fit_output(gray, output, view, self.regressor.threshold, np.flatnonzero(is_new).tolist())
+        return propose(gray, context, prior, fits.curves, limit)
 
     @staticmethod
-    def judged(prepared: Prepared, outputs: NDArray[np.float32]) -> FloatArray:
-        """How likely each candidate (N,) is a boundary: the classifier's word, and a glance's on where it runs."""
-        told = outputs[:, TRUE_LANE].astype(np.float64)
-        if prepared.prior is None:
-            return told
-        odds = prepared.prior.odds([candidate.curve for candidate in prepared.candidates])
-        return np.asarray(told * odds / (1.0 - told + told * odds))
+    def probabilities(proposals: Proposals, outputs: NDArray[np.float32]) -> FloatArray:
+        """Returns how likely each candidate (N,) is a boundary: the classifier's probability and the prior's odds."""
+        probability = outputs[:, BOUNDARY].astype(np.float64)
+        if proposals.prior is None:
+            return probability
+        odds = proposals.prior.odds(proposals.curves)
+        return np.asarray(probability * odds / (1.0 - probability + probability * odds))
 
-    def _together(
-        self,
-        candidates: Sequence[Candidate],
-        probability: FloatArray,
-        away: FloatArray,
-        chosen: Sequence[int],
-        view: RoadView,
-    ) -> list[Candidate]:
-        """Of each chosen candidate the mean with all that are like it: each errs in its own way, the less sure more."""
-        rows = view.horizon + np.asarray(_ROWS) * view.depth
-        curves = [candidate.curve for candidate in candidates]
-        leaning = np.hypot(1.0, [float(curves[i].slope(rows[1])) for i in chosen]) / USUAL_LEANING
-        alike = away[chosen] <= self.alike * np.maximum(1.0, leaning)[:, None]
-        weights = alike * probability**8
-        columns = weights @ curve_columns(curves, rows) / weights.sum(axis=1, keepdims=True)
-        means = curves_through(view.horizon, rows, columns)
-        spans = visible_spans(means, view, TOP_SHARE)
-        return [
-            Candidate(mean, *(span or (candidates[i].top, candidates[i].bottom)), candidates[i].strength)
-            for i, mean, span in zip(chosen, means, spans, strict=True)
+    def decide(self, gray: Image, proposals: Proposals, outputs: NDArray[np.float32]) -> Detections:
+        """Returns the boundaries among `proposals`, given the classifier's outputs (N, 2) for their patches.
+
+        Which candidates are accepted is decided with the prior; where exactly a line runs, the patches say better.
+        """
+        started = time.perf_counter()
+        own = outputs[:, BOUNDARY].astype(np.float64)
+        probability = self.probabilities(proposals, outputs)
+        order = np.argsort(-own, kind="stable")
+        accepted = order[probability[order] >= self.threshold]
+        prior_horizon = None if proposals.prior is None else proposals.prior.view.horizon
+        if not len(accepted):
+            return Detections((), proposals.view, proposals.horizon_weight, prior_horizon)
+        curves, spans = proposals.curves.take(accepted), proposals.spans.take(accepted)
+        gaps = np.abs(_gaps(curves, proposals.view)).max(axis=2)
+        chosen = non_maximum_suppression(gaps <= _SAME)
+        means = _means(curves, own[accepted], gaps, chosen, proposals.view)
+        fits = fit_curves(gray, means, spans.take(chosen), proposals.view)
+        visible = visible_spans(fits.curves, fits.view)
+        detections = [
+            Detection(fits.curves[i], fits.covariances[i], float(visible.top[i]), float(visible.bottom[i]), p)
+            for i, p in enumerate(probability[accepted[chosen]].tolist())
+            if visible.visible[i]
         ]
-
-    def _apart(self, detections: Sequence[Detection], view: RoadView) -> list[Detection]:
-        """The detections, most probable first, that keep their distance from all better ones; then left to right."""
-        gaps = _gaps([detection.curve for detection in detections], view)
-        on_one_side = (gaps > 0.0).all(axis=2) | (gaps < 0.0).all(axis=2)
-        kept = _kept(on_one_side & (np.abs(gaps).min(axis=2) > self.separation))
-        return sorted((detections[i] for i in kept), key=lambda d: float(d.curve.x(view.bottom)))
+        boundaries = _separated(sorted(detections, key=lambda detection: -detection.probability), fits.view)
+        fit_s = time.perf_counter() - started
+        return Detections(boundaries, fits.view, proposals.horizon_weight, prior_horizon, fit_s)
 
 
-def _kept(apart: NDArray[np.bool_]) -> list[int]:
-    """Places of those, the first ones first, that are `apart` (N, N) from all that are kept before them."""
-    kept: list[int] = []
-    for i, others in enumerate(apart):
-        if others[kept].all():
-            kept.append(i)
-    return kept
+def _means(
+    curves: Curves, probability: FloatArray, gaps: FloatArray, chosen: NDArray[np.intp], view: RoadView
+) -> Curves:
+    """Returns the mean of each chosen candidate with all that are close to it, less certain ones with less weight.
+
+    Each candidate errs in its own way.
+    """
+    rows = view.horizon + ANCHORS * view.depth
+    slope = curves.take(chosen).slope(rows[1:2])[:, 0]
+    obliquity = np.maximum(1.0, np.hypot(1.0, slope) / _USUAL_OBLIQUITY)
+    weights = (gaps[chosen] <= _AVERAGED * obliquity[:, None]) * probability**8
+    return Curves.through(view.horizon, rows, weights @ curves.x(rows) / weights.sum(axis=1, keepdims=True))
 
 
-def _gaps(curves: Sequence[Curve], view: RoadView) -> FloatArray:
-    """How far each curve is right of each other one at three depths, in rows below the horizon (N, N, 3)."""
-    rows = np.array([view.row_at(0.25), view.row_at(0.5), view.row_at(1.0)])
-    places = curve_columns(curves, rows) / (rows - view.horizon)
-    return places[:, None] - places
+def _separated(detections: list[Detection], view: RoadView) -> tuple[Detection, ...]:
+    """Returns the detections, given most probable first, that neither cross nor come close to a better one.
+
+    They are returned from left to right.
+    """
+    if not detections:
+        return ()
+    gaps = _gaps(Curves.of([detection.curve for detection in detections]), view)
+    on_one_side = (gaps > 0.0).all(axis=2) | (gaps < 0.0).all(axis=2)
+    kept = non_maximum_suppression(~on_one_side | (np.abs(gaps).min(axis=2) <= _CLOSEST))
+    return tuple(sorted((detections[i] for i in kept.tolist()), key=lambda each: float(each.curve.x(view.bottom))))
+
+
+def _gaps(curves: Curves, view: RoadView) -> FloatArray:
+    """Returns how far each curve is to the right of each other one at three rows, in row offsets (N, N, 3)."""
+    below = _COMPARED * view.depth
+    places = curves.x(view.horizon + below) / below
+    return np.asarray(places[:, None] - places)

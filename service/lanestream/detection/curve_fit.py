@@ -1,118 +1,350 @@
-"""Sub-pixel refinement: a candidate's curve moved onto the paint beneath it, with what the fit is worth.
+"""The joint curve fit: moves the boundaries of a frame onto their paint, all together, to a fraction of a pixel.
 
-The strip along the candidate is searched for a narrow bright bar row by row, and the curve is pulled onto the bars by
-reweighted least squares. Where the paint is missing, or shows no bend, the candidate's own line is the prior, and so is
-the road that it shares with the others: a dashed marking keeps its direction, and far ends meet at one point. A fit on
-one stripe of a double line is moved to between the two.
+The marking filter finds bright bars row by row on a strip along each curve, and reweighted least squares pulls the curve
+onto them. Where paint is missing the curve itself is the prior, and so is the road that it shares with the others: on a
+flat road all boundaries have one vanishing point, one horizon and one curvature. A dashed line keeps its direction, and
+a far end behind a car has that of its neighbors. Between the two stripes of a double line lies its middle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.bars import Along, BarSearch
-from lanestream.detection.commonroad import Boundaries, CommonRoad
-from lanestream.detection.doubles import DoubleLines
-from lanestream.detection.features import resized
-from lanestream.road.curve import Curve, FloatArray, curve_basis, curve_columns, curves_through
-from lanestream.road.results import Candidate
-from lanestream.road.view import Image, RoadView, Scaling
+from lanestream.detection.marking_filter import bar_contrast
+from lanestream.road.curve import ANCHORS, Curves, FloatArray
+from lanestream.road.view import Image, RoadView, Spans, visible_spans
 
-# Nearer to the horizon than this, in depths, a bend has no bounds, and paint tells nothing of it.
+# hypot(1, slope) of an ego boundary half a lane of 3.6 m beside a camera 1.45 m high. Errors across the image of more
+# oblique lines are larger for the same distance on the road, so their strips and tolerances are wider.
+_USUAL_OBLIQUITY: Final = 1.6
+
+# All widths are shares of the row offset, as everything on the road is. Markings are about as wide as one of these.
+_MARKING_WIDTHS: Final = (0.05, 0.1, 0.17)
+# Rows of a strip, from the bottom up to this share of the depth.
+_ROWS: Final = 48
+_TOP_SHARE: Final = 0.06
+# A bar's weight is relative to the strip's best rows: the best tenth, by this factor.
+_BEST_ROWS: Final = 0.1
+_BEST_FACTOR: Final = 0.4
+# The center of a bar in one row is known to this many pixels, plus this share of the row offset.
+_ROW_NOISE: Final = 1.0
+_BLUR: Final = 0.012
+# Nearer to the horizon than this share of the depth the curvature term has no bounds, and paint says nothing of it.
 _FARTHEST: Final = 0.04
+# Neighboring rows share their errors: about four of them are worth one.
+_CORRELATED_ROWS: Final = 4.0
+# A candidate's columns at the anchors are known to about this, in depths.
+_CANDIDATE_SIGMA: Final = np.array([0.03, 0.02, 0.1])
+
+# The vanishing point's column and the curvature term of a boundary are those of the road within these deviations, in
+# depths; on a curving road also within this share of its curvature, because the inner boundary curves more sharply.
+_COMMON_SIGMA: Final = (0.003, 0.0006)
+_CURVING_SHARE: Final = 0.1
+# A boundary this many deviations from the common road counts half: it is part of another road, or not a boundary.
+_OUTLIER: Final = 3.0
+# Before the fit the road's column, horizon and curvature are known to this, in depths; the horizon moves no farther.
+_ROAD_SIGMA: Final = np.array([0.1, 0.03, 0.03])
+_MOST_PITCH: Final = 0.04
 
 
 @dataclass(frozen=True)
-class Fit:
-    """A refined curve in image pixels and the covariance (3, 3) of its coefficients."""
+class FitSettings:
+    """How far from the curve paint is looked for, and how strictly.
 
-    curve: Curve
-    covariance: FloatArray
-
-    def moved(self, by: float) -> Fit:
-        """The fit moved to the right by `by` times its rows below the horizon: on the ground everywhere as far."""
-        v, b, k = self.curve.coefficients
-        return replace(self, curve=replace(self.curve, coefficients=(v, b + by, k)))
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """The fit's settings; all widths are shares of the rows below the horizon, as everything on the road is.
-
-    `bars` are searched for along the candidate. The curve is told by its columns at the depths `anchors`, where the
-    candidate may be off by about `doubt`. A bar's centre on one row is good to `noise` pixels of a 640 pixel wide image
-    plus `blur` of the rows below the horizon. Leaning candidates err more from side to side for the same distance
-    across: for them `doubt` and `steps`, the distances at which bars lose half their weight, are wider. All candidates
-    are held to one `road`, and those on one of the `doubles` to its middle. Images wider than `detail_width` are
-    reduced to it.
+    Strips reach `reach` to either side in `cells` cells. In each of the `rounds` bars at this distance from the curve
+    have a quarter of their weight. With `move_horizon` the horizon is fitted too.
     """
 
-    bars: BarSearch = BarSearch()
-    anchors: tuple[float, float, float] = (1.0, 0.45, 0.15)
-    doubt: tuple[float, float, float] = (0.03, 0.02, 0.1)
-    noise: float = 1.0
-    blur: float = 0.012
-    steps: tuple[float, ...] = (0.06, 0.045, 0.03)
-    road: CommonRoad = CommonRoad()
-    doubles: DoubleLines = DoubleLines()
-    detail_width: int = 640
+    reach: float = 0.16
+    cells: int = 97
+    rounds: tuple[float, ...] = (0.06, 0.045, 0.03)
+    move_horizon: bool = True
 
-    def refine(
-        self, image: Image, candidates: Sequence[Candidate], view: RoadView, doubts: FloatArray | None = None
-    ) -> tuple[list[Fit], RoadView]:
-        """A fit for each candidate of a BGR image (H, W, 3), and `view` with the horizon that they agree on.
 
-        `doubts` (N, 3) are how far off each candidate may be at the `anchors`, in pixels, where that is known.
-        """
-        if not candidates:
-            return [], view
-        scaling = Scaling(min(1.0, self.detail_width / view.width))
-        detail = resized(image, scaling)
-        spans = [(candidate.top, candidate.bottom) for candidate in candidates]
-        along = self.bars.along([candidate.curve for candidate in candidates], spans, view)
-        if doubts is None:
-            doubts = along.leaning[:, None] * np.asarray(self.doubt) * view.depth
-        fits, view = self._fits(along, self.bars.find(detail, scaling, along), view, doubts)
-        along = self.doubles.bars.along([fit.curve for fit in fits], spans, view)
-        stripes = self.doubles.bars.find(detail, scaling, along)
-        beside = [self.doubles.middle(bars) * leaning for bars, leaning in zip(stripes, along.leaning, strict=True)]
-        return [fit.moved(by) for fit, by in zip(fits, beside, strict=True)], view
+@dataclass(frozen=True)
+class Fits:
+    """Fitted curves, the covariances (N, 3, 3) of their coefficients, and the view with the horizon they agree on."""
 
-    def _fits(
-        self, along: Along, bars: NDArray[np.float32], view: RoadView, doubts: FloatArray
-    ) -> tuple[list[Fit], RoadView]:
-        """Columns at the anchor rows by least squares with the curves so far, and the road they share, as the prior."""
-        anchors = view.horizon + np.asarray(self.anchors) * view.depth
-        columns = curve_columns(along.curves, anchors)
-        boundaries = Boundaries(columns, anchors, view.horizon, view.horizon, along.leaning, view.depth)
-        prior = np.eye(3) / doubts[:, None] ** 2
-        # Sums over a strip's cells, and sums of where they are, in one product.
-        sums = np.stack([np.ones(self.bars.cells, np.float32), self.bars.across()], axis=1)
-        found, normal = self.road.begun(boundaries), prior
-        for reach in self.steps:
-            basis = curve_basis(boundaries.horizon, along.y) @ boundaries.to_curve
-            seen = along.places((basis @ (columns + found.shifts)[:, :, None])[:, :, 0])
-            off = (self.bars.across() - seen.astype(np.float32)[:, :, None]) * np.float32(1.0 / reach)
-            total, moment = np.moveaxis((bars / (1.0 + off * off) ** 2) @ sums, 2, 0).astype(np.float64)
-            away = along.columns(moment / np.maximum(total, 1e-6)) - (basis @ columns[:, :, None])[:, :, 0]
-            # A row counts once, however wide its bar; a row without a bar does not count.
-            trust = np.minimum(total / 2.0, 1.0) * (along.y - boundaries.horizon > _FARTHEST * view.depth)
-            trusted = basis.swapaxes(1, 2) * (trust / self._sigma(along, view) ** 2)[:, None]
-            normal = prior + trusted @ basis
-            found = self.road.agree(normal, (trusted @ away[:, :, None])[:, :, 0], boundaries, found)
-            boundaries, found = self.road.nodded(boundaries, found)
-        # Neighbouring rows share their errors: about four of them are worth one.
-        worth = self.road.agree(prior + (normal - prior) / 4.0, np.zeros_like(found.shifts), boundaries, found)
-        covariances = boundaries.to_curve @ worth.covariances @ boundaries.to_curve.T
-        curves = curves_through(boundaries.horizon, anchors, columns + found.shifts)
-        fits = [Fit(curve, covariance) for curve, covariance in zip(curves, covariances, strict=True)]
-        return fits, replace(view, horizon=boundaries.horizon)
+    curves: Curves
+    covariances: FloatArray
+    view: RoadView
 
-    def _sigma(self, along: Along, view: RoadView) -> FloatArray:
-        """How exactly a bar's centre is known on each row (N, R), in pixels."""
-        return self.noise * view.width / 640.0 + self.blur * along.below
+
+def fit_curves(
+    gray: Image,
+    curves: Curves,
+    spans: Spans,
+    view: RoadView,
+    settings: FitSettings = FitSettings(),  # noqa: B008 - immutable
+    sigma: FloatArray | None = None,
+    anchors: FloatArray = ANCHORS,
+) -> Fits:
+    """Fits `curves` to the paint in a gray working image, within the rows where they are visible, or else their `spans`.
+
+    `sigma` (N, 3) are the deviations in pixels of the curves' columns at the `anchors`, if known.
+    """
+    if not len(curves):
+        return Fits(curves, np.empty((0, 3, 3)), view)
+    visible = visible_spans(curves, view, _TOP_SHARE)
+    top = np.where(visible.visible, visible.top, spans.top)
+    bottom = np.where(visible.visible, visible.bottom, spans.bottom)
+    strips = _Strips.along(curves, top, bottom, view, settings.reach, settings.cells, _ROWS)
+    bars = strips.bars(gray, _MARKING_WIDTHS)
+    if sigma is None:
+        sigma = strips.obliquity[:, None] * _CANDIDATE_SIGMA * view.depth
+    fits = _JointFit(strips, bars, curves, view, sigma, anchors).run(settings)
+    return Fits(_between_stripes(gray, fits, top, bottom), fits.covariances, fits.view)
+
+
+@dataclass(frozen=True)
+class _Strips:
+    """Strips along N curves on R rows: the rows `y` (N, R), the curves' columns `x` and row offsets `u` there.
+
+    Positions `across` (C,) are in row offsets times the curve's `obliquity` (N,).
+    """
+
+    y: FloatArray
+    x: FloatArray
+    u: FloatArray
+    obliquity: FloatArray
+    across: NDArray[np.float32]
+
+    @classmethod
+    def along(
+        cls, curves: Curves, top: FloatArray, bottom: FloatArray, view: RoadView, reach: float, cells: int, rows: int
+    ) -> _Strips:
+        y = top[:, None] + (bottom - top)[:, None] * np.linspace(0.0, 1.0, rows)
+        slope = curves.slope(0.5 * (top + bottom)[:, None])[:, 0]
+        obliquity = np.maximum(1.0, np.hypot(1.0, slope) / _USUAL_OBLIQUITY)
+        across = np.linspace(-reach, reach, cells, dtype=np.float32)
+        return cls(y, curves.x(y), y - view.horizon, obliquity, across)
+
+    def bars(self, gray: Image, widths: Sequence[float]) -> NDArray[np.float32]:
+        """Returns the contrast (N, R, C), 0 to 1, of bars of the given widths."""
+        cells = len(self.across)
+        reach = (self.u * self.obliquity[:, None]).astype(np.float32)
+        columns = reach[:, :, None] * self.across
+        columns += self.x.astype(np.float32)[:, :, None]
+        rows = np.broadcast_to(self.y.astype(np.float32)[:, :, None], columns.shape)
+        maps = columns.reshape(-1, cells), rows.reshape(-1, cells)
+        strips = cv2.remap(gray, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(columns.shape)
+        per_cell = (cells - 1) / float(self.across[-1] - self.across[0])
+        contrast = np.empty(strips.shape, np.float32)
+        # A strip that is wider by its obliquity has narrower bars; strips with bars of one width are filtered together.
+        groups: dict[tuple[int, ...], list[int]] = {}
+        for index, obliquity in enumerate(self.obliquity.tolist()):
+            groups.setdefault(tuple(max(1, round(w / obliquity * per_cell)) | 1 for w in widths), []).append(index)
+        for bar_widths, members in groups.items():
+            filtered = bar_contrast(strips[members].reshape(-1, cells), bar_widths)
+            contrast[members] = filtered.reshape(len(members), -1, cells)
+        # Five gray levels above its own row's texture is a bar that a person would see. Squared: a few bright dots count
+        # for more than a wheel track that is a little lighter all along.
+        texture = np.abs(contrast).mean(axis=2, keepdims=True)
+        place = int((1.0 - _BEST_ROWS) * (contrast.shape[1] - 1))
+        best = np.maximum(np.partition(contrast.max(axis=2), place, axis=1)[:, place], 0.0)
+        bars = (contrast - texture) / (texture + (5.0 + _BEST_FACTOR * best)[:, None, None])
+        np.clip(bars, 0.0, 1.0, out=bars)
+        bars *= bars
+        return bars
+
+
+class _JointFit:
+    """Least squares over all boundaries of a frame and the road that they share.
+
+    Boundary n is x(t) = v + b t + c / t with t = u / depth: its `theta` (3,) are v, b and c = k / depth, all in pixels.
+    The road is V, H, C: the column of its vanishing point, the rows by which its horizon is below the present one, and
+    its curvature. Two constraints tie each boundary to it: v + dv/dh H = V and c + dc/dh H = C.
+    """
+
+    def __init__(
+        self,
+        strips: _Strips,
+        bars: NDArray[np.float32],
+        curves: Curves,
+        view: RoadView,
+        sigma: FloatArray,
+        anchors: FloatArray,
+    ) -> None:
+        self._strips = strips
+        self._bars = bars
+        self._view = view
+        self._rows = view.horizon + anchors * view.depth
+        self._start = curves.x(self._rows)
+        self._precision = sigma**-2.0
+        self._row_precision = (_ROW_NOISE + _BLUR * strips.u) ** -2.0
+        # Sums over a strip's cells, and sums of their positions, in one product.
+        self._moments = np.stack([np.ones_like(strips.across), strips.across], axis=1)
+        # The constraints' coefficients (2 N, 3 N + 3) of all shifts, V, H and C; those of H depend on the horizon.
+        number = len(curves)
+        constraints = np.zeros((number, 2, 3 * number + 3))
+        indices = np.arange(number)
+        constraints[indices, 0, 3 * indices] = constraints[indices, 1, 3 * indices + 2] = 1.0
+        constraints[:, 0, -3] = constraints[:, 1, -1] = -1.0
+        self._constraints = constraints
+
+    def run(self, settings: FitSettings) -> Fits:
+        depth, expected = self._view.depth, self._view.horizon
+        number = len(self._start)
+        horizon = expected
+        columns = self._start
+        theta = columns @ np.linalg.inv(_basis((self._rows - horizon) / depth)).T
+        road = np.array([np.median(theta[:, 0]), 0.0, np.median(theta[:, 2])])
+        solution = np.zeros(3 * number + 3)
+        for reach in settings.rounds:
+            basis = _basis((self._rows - horizon) / depth)
+            inverse = np.linalg.inv(basis)
+            start = self._start @ inverse.T
+            row_basis = _basis((self._strips.y - horizon) / depth)
+            information, moment = self._paint(row_basis, start, columns @ inverse.T, reach, horizon)
+            prior = np.einsum("ij,ni,ik->njk", basis, self._precision, basis)
+            if not settings.move_horizon:
+                road_sigma = np.array([_ROAD_SIGMA[0], 1e-9, _ROAD_SIGMA[2]])
+            else:
+                road_sigma = _ROAD_SIGMA
+            known = np.array([np.median(start[:, 0]), expected - horizon, np.median(start[:, 2])])
+            constraints, weights = self._weighted_constraints(inverse, start, solution, road, horizon)
+            normal, right = self._normal_equations(prior + information, constraints, weights, known, road_sigma)
+            right[: 3 * number] += moment.ravel()
+            right -= constraints.T @ (weights * start[:, [0, 2]].ravel())
+            solution = np.linalg.solve(normal, right)
+            columns = self._start + solution[: 3 * number].reshape(-1, 3) @ basis.T
+            road = solution[-3:].copy()
+            moved = horizon + road[1] - expected if settings.move_horizon else 0.0
+            horizon = expected + float(np.clip(moved, -_MOST_PITCH * depth, _MOST_PITCH * depth))
+            # The shifts belong to the columns, and are expressed below the new horizon from now on.
+            solution[: 3 * number] = (
+                (columns - self._start) @ np.linalg.inv(_basis((self._rows - horizon) / depth)).T
+            ).ravel()
+            road[1] = 0.0
+        normal, _ = self._normal_equations(
+            prior + information / _CORRELATED_ROWS, constraints, weights, known, road_sigma
+        )
+        covariance = np.linalg.inv(normal)[: 3 * number, : 3 * number].reshape(number, 3, number, 3)
+        own = covariance[np.arange(number), :, np.arange(number), :]
+        # From v, b, c in terms of t to v, b, k in terms of u.
+        unit = np.array([1.0, 1.0 / depth, depth])
+        fitted = Curves.through(horizon, self._rows, columns)
+        return Fits(fitted, own * np.outer(unit, unit), self._view.with_horizon(horizon))
+
+    def _paint(
+        self, row_basis: FloatArray, start: FloatArray, theta: FloatArray, reach: float, horizon: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Returns what the bars near the curves `theta` (N, 3) say: normal equations (N, 3, 3) and (N, 3) of shifts."""
+        strips = self._strips
+        scale = strips.u * strips.obliquity[:, None]
+        at = (row_basis @ theta[:, :, None])[:, :, 0]
+        place = ((at - strips.x) / scale).astype(np.float32)
+        distance = strips.across - place[:, :, None]
+        distance *= np.float32(1.0 / reach)
+        distance *= distance
+        distance += np.float32(1.0)
+        distance *= distance
+        total, moment = np.moveaxis((self._bars / distance) @ self._moments, 2, 0).astype(np.float64)
+        seen = strips.x + moment / np.maximum(total, 1e-6) * scale
+        residual = seen - (row_basis @ start[:, :, None])[:, :, 0]
+        # A row counts once, however wide its bar; a row without a bar does not count.
+        is_near = strips.y - horizon > _FARTHEST * self._view.depth
+        precision = np.minimum(total / 2.0, 1.0) * is_near * self._row_precision
+        weighted = row_basis.swapaxes(1, 2) * precision[:, None]
+        return weighted @ row_basis, (weighted @ residual[:, :, None])[:, :, 0]
+
+    def _weighted_constraints(
+        self, inverse: FloatArray, start: FloatArray, solution: FloatArray, road: FloatArray, horizon: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Returns the constraints (2 N, 3 N + 3) and their weights (2 N,), lower for boundaries far from the road."""
+        depth = self._view.depth
+        shifts = solution[:-3].reshape(-1, 3)
+        # How a boundary's parameters change with the horizon if its columns at the anchors stay.
+        t = (self._rows - horizon) / depth
+        theta = start + shifts
+        drift = ((theta[:, 1:2] - theta[:, 2:] / t**2) / depth) @ inverse.T
+        self._constraints[:, :, -2] = drift[:, [0, 2]]
+        curving = _CURVING_SHARE * abs(road[2]) / depth
+        sigma = depth * self._strips.obliquity[:, None] * (np.asarray(_COMMON_SIGMA) + curving)
+        tied = theta[:, [0, 2]] + drift[:, [0, 2]] * road[1] - road[[0, 2]]
+        distance = ((tied / sigma) ** 2).sum(axis=1, keepdims=True)
+        weights = sigma**-2.0 / (1.0 + distance / _OUTLIER**2)
+        return self._constraints.reshape(2 * len(start), -1), weights.ravel()
+
+    def _normal_equations(
+        self,
+        information: FloatArray,
+        constraints: FloatArray,
+        weights: FloatArray,
+        known: FloatArray,
+        road_sigma: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Returns the normal matrix of all shifts and the road, and the right side with what is known of the road."""
+        number = len(information)
+        normal = constraints.T @ (weights[:, None] * constraints)
+        blocks = normal[: 3 * number, : 3 * number].reshape(number, 3, number, 3)
+        indices = np.arange(number)
+        blocks[indices, :, indices, :] += information
+        normal[: 3 * number, : 3 * number] = blocks.reshape(3 * number, 3 * number)
+        precision = (self._view.depth * road_sigma) ** -2.0
+        normal[[-3, -2, -1], [-3, -2, -1]] += precision
+        right = np.zeros(len(normal))
+        right[-3:] = precision * known
+        return normal, right
+
+
+def _basis(t: FloatArray) -> FloatArray:
+    """Returns d x / d (v, b, c) at `t` (...,) as an array (..., 3)."""
+    t = np.maximum(t, 1e-3)
+    basis = np.empty((*t.shape, 3))
+    basis[..., 0] = 1.0
+    basis[..., 1] = t
+    basis[..., 2] = 1.0 / t
+    return basis
+
+
+# --- Double lines ------------------------------------------------------------------------------------------------------
+
+# A fit settles on the stripe that is seen better, on one in this frame and on the other in the next. Along the fit both
+# stripes are straight, so their contrast adds up over the rows, and each is a peak of the mean row. Strips along a fit:
+# reach, cells, rows, nearest share of the depth, widths of stripes.
+_STRIPE_REACH, _STRIPE_CELLS, _STRIPE_ROWS, _STRIPE_TOP_SHARE = 0.4, 129, 24, 0.2
+_STRIPE_WIDTHS: Final = (0.05, 0.09)
+# A stripe has this contrast in this share of the rows, and is no farther than this from the fit. The stripes of a double
+# line are this far apart.
+_STRIPE_CONTRAST, _STRIPE_SHARE, _STRIPE_FARTHEST = 0.06, 0.3, 0.2
+_STRIPE_GAPS: Final = (0.07, 0.25)
+
+
+def _between_stripes(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArray) -> Curves:
+    """Returns the fitted curves, those on a stripe of a double line moved to the middle between its stripes."""
+    view = fits.view
+    visible = visible_spans(fits.curves, view, _STRIPE_TOP_SHARE)
+    top = np.where(visible.visible, visible.top, top)
+    bottom = np.where(visible.visible, visible.bottom, bottom)
+    strips = _Strips.along(fits.curves, top, bottom, view, _STRIPE_REACH, _STRIPE_CELLS, _STRIPE_ROWS)
+    bars = strips.bars(gray, _STRIPE_WIDTHS)
+    mean = bars.mean(axis=1)
+    # A fit that is a little off lets a stripe move from cell to cell.
+    shown = (bars > _STRIPE_CONTRAST).astype(np.uint8)
+    shown = cv2.dilate(shown.reshape(-1, _STRIPE_CELLS), np.ones((1, 3), np.uint8)).reshape(bars.shape)
+    is_stripe = (mean[:, 1:-1] >= mean[:, :-2]) & (mean[:, 1:-1] > mean[:, 2:])
+    is_stripe &= shown.mean(axis=1)[:, 1:-1] >= _STRIPE_SHARE
+    is_stripe &= np.abs(strips.across[1:-1]) <= _STRIPE_FARTHEST
+    shift = np.zeros(len(fits.curves))
+    for index in np.flatnonzero(is_stripe.sum(axis=1) >= 2).tolist():
+        cells = 1 + np.flatnonzero(is_stripe[index])
+        # The clearest stripe first.
+        stripes = strips.across[cells[np.argsort(-mean[index, cells], kind="stable")]].tolist()
+        shift[index] = _middle(stripes) * strips.obliquity[index]
+    # Moved by a share of the row offset, a curve moves equally far on the ground everywhere.
+    return Curves(fits.curves.horizon, fits.curves.coefficients + shift[:, None] * np.array([0.0, 1.0, 0.0]))
+
+
+def _middle(stripes: Sequence[float]) -> float:
+    """Returns the middle between the stripe nearest to the fit and the clearest one that may belong to it; else 0."""
+    nearest = min(stripes, key=abs)
+    closest, farthest = _STRIPE_GAPS
+    others = [stripe for stripe in stripes if closest <= abs(stripe - nearest) <= farthest]
+    return 0.5 * (nearest + others[0]) if others else 0.0

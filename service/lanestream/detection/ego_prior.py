@@ -1,4 +1,9 @@
-"""A glance at the whole road before lines are looked for: where the regressor sees the ego lane, and how surely."""
+"""The ego-lane prior: where the regressor sees the two boundaries of the ego lane, and how certain it is.
+
+The regressor looks at the crop of the whole road, in which the horizon always has the same row. It returns where both
+boundaries run, their standard deviations, whether each is there, and where the horizon really is. The regression
+detector reports these boundaries; the candidate detector searches around them.
+"""
 
 from __future__ import annotations
 
@@ -6,137 +11,219 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from lanestream.detection import Network, Question, Steps
-from lanestream.detection.curve_fit import Fit
-from lanestream.detection.lattice import USUAL_WIDTH, LaneSpacing
-from lanestream.detection.regression_detector import ANCHORS, RegressionDetector, RegressorOutput
-from lanestream.road.curve import Curve, FloatArray, curve_columns
-from lanestream.road.view import Image, RoadView
+from lanestream.detection.interface import Infer
+from lanestream.detection.vanishing_point import VanishingPoint
+from lanestream.images.resizing import resized
+from lanestream.road.crops import RoadCropGeometry
+from lanestream.road.curve import Curves, FloatArray
+from lanestream.road.view import USUAL_LANE_WIDTH, Image, RoadView
 
-# A boundary whose place is known no better than this, in image widths, leads nowhere: a network that says so has seen
-# a road unlike those it knows.
-_MOST_DOUBT: Final = 0.1
+# The regressor gives columns at these shares of the depth below the horizon.
+REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
 
-# A horizon farther than this from where it was taken to be, in depths, is worth a second look at the right place.
-_SECOND_LOOK: Final = 0.03
+# Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each.
+UNKNOWN_HORIZONS: Final = (0.32, 0.39, 0.46, 0.53, 0.6)
 
-# The shares of the depth at which places are compared: farther away all lines of a road are near one another.
-_COMPARED: Final = np.array(ANCHORS[:2])
-
-# No line is told more exactly than this, in rows below the horizon.
-_EXACT: Final = 0.02
-
-# What is nearer than this to a boundary that is followed, across it, in rows below the horizon, is that boundary.
-_FOLLOWED: Final = 0.05
-
-# How many times likelier a line is a boundary where it is a whole lane beside the ego lane, and the share of that where
-# it is far from such places: the feet of walls and the edges of the pavement run there, and hardly a boundary.
-_REPEATED: Final = 1.5
-_OFF_LATTICE: Final = 0.05
+# A boundary with a larger mean deviation, in image widths, is no guide: the network has not seen such a road.
+_MOST_UNCERTAIN: Final = 0.1
+# At these anchors lateral positions are compared: farther away all lines of a road are close together.
+_COMPARED: Final = REGRESSOR_ANCHORS[:2]
+# No boundary is known more exactly than this, in row offsets.
+_LEAST_SIGMA: Final = 0.02
+# How many times likelier a line is a boundary if it is a whole number of lanes beside the ego lane, and the share of
+# that if it is far from such a position: feet of walls and edges of the pavement run there, and hardly a boundary.
+_SPACED_ODDS: Final = 1.5
+_UNSPACED_SHARE: Final = 0.05
 
 
 @dataclass(frozen=True)
-class PriorBoundary:
-    """An ego boundary that was seen at a glance.
+class RegressorOutput:
+    """The regressor's output for one frame, relative to its road crop.
 
-    `curve` is in image pixels; `spread` (2,) are its standard deviations at the compared rows, in rows below the
-    horizon; `presence` is the chance that it is there at all. `painted` is the curve moved onto the paint beneath
-    it, where that was looked for.
+    `columns` (2, 3) and `sigma` (2, 3) of the left and the right boundary at the anchors are in image widths from the
+    middle; `presence` (2,) is from 0 to 1; `horizon` is in depths below where the crop assumed it.
     """
 
-    curve: Curve
-    spread: FloatArray
-    presence: float
-    painted: Curve | None = None
+    SIZE = 15
+
+    columns: FloatArray
+    sigma: FloatArray
+    presence: FloatArray
+    horizon: float
+
+    @classmethod
+    def of(cls, output: NDArray[np.float32]) -> RegressorOutput:
+        """Reads one row (15,) of the network's outputs."""
+        values = np.asarray(output, dtype=np.float64)
+        return cls(values[:6].reshape(2, 3), values[6:12].reshape(2, 3), values[12:14], float(values[14]))
+
+    @property
+    def uncertainty(self) -> float:
+        """The mean standard deviation, plus a little for a horizon that is not where the crop assumed it."""
+        return float(self.sigma.mean() + 0.05 * abs(self.horizon))
+
+    @property
+    def mirrored(self) -> RegressorOutput:
+        """The output of a mirrored crop, mirrored back."""
+        return RegressorOutput(-self.columns[::-1], self.sigma[::-1], self.presence[::-1], self.horizon)
+
+    def mean(self, other: RegressorOutput) -> RegressorOutput:
+        """Returns the mean of two outputs for one crop."""
+        return RegressorOutput(
+            0.5 * (self.columns + other.columns),
+            0.5 * (self.sigma + other.sigma),
+            0.5 * (self.presence + other.presence),
+            0.5 * (self.horizon + other.horizon),
+        )
+
+    def view(self, assumed: RoadView) -> RoadView:
+        """Returns the view with the horizon where the network sees it."""
+        horizon = assumed.horizon + self.horizon * assumed.depth
+        return assumed.with_horizon(float(np.clip(horizon, 0.0, 0.9 * assumed.height)))
+
+    def curves(self, view: RoadView) -> Curves:
+        """Returns both boundaries, left and right, in pixels of `view`, which has the network's horizon."""
+        rows = view.horizon + REGRESSOR_ANCHORS * view.depth
+        return Curves.through(view.horizon, rows, view.middle + self.columns * view.width)
 
 
 @dataclass(frozen=True)
 class EgoPrior:
-    """What was seen at a glance: the road view with its horizon, and the ego boundaries, None where there is none.
+    """The ego boundaries that the regressor sees well enough, from left to right; none, one or two.
 
-    All in image pixels; the curves share the view's horizon.
+    `sides` are -1 (left) and +1 (right). `curves` are in pixels of the working image below the horizon of `view`, and
+    `sigma` (M, 2) in row offsets. `presence` (M,) is the probability that the boundary exists at all.
     """
 
     view: RoadView
-    left: PriorBoundary | None
-    right: PriorBoundary | None
+    sides: tuple[int, ...]
+    curves: Curves
+    sigma: FloatArray
+    presence: FloatArray
 
     @property
-    def seen(self) -> tuple[PriorBoundary, ...]:
-        """The boundaries that were seen, left to right."""
-        return tuple(boundary for boundary in (self.left, self.right) if boundary is not None)
+    def vanishing_point(self) -> VanishingPoint:
+        """What the boundaries share. There must be one."""
+        v, _, k = self.curves.coefficients.mean(axis=0).tolist()
+        return VanishingPoint(v, self.view.horizon, k, 1.0)
 
-    @property
-    def curves(self) -> tuple[Curve, ...]:
-        """Their curves."""
-        return tuple(boundary.curve for boundary in self.seen)
+    def spacing(self, places: FloatArray, least: float) -> LaneSpacing | None:
+        """Returns the lanes beside the ego lane, whose boundaries have the lateral `places` (M,); None without any."""
+        if not self.sides:
+            return None
+        at = dict(zip(self.sides, places.tolist(), strict=True))
+        left = at[-1] if -1 in at else at[1] - USUAL_LANE_WIDTH
+        right = at[1] if 1 in at else at[-1] + USUAL_LANE_WIDTH
+        return LaneSpacing(left, right, least)
 
-    @property
-    def painted(self) -> tuple[Curve, ...]:
-        """Their curves on the paint, of those for which it was looked for."""
-        return tuple(boundary.painted for boundary in self.seen if boundary.painted is not None)
+    def odds(self, curves: Curves) -> FloatArray:
+        """Returns how many times likelier (N,) `curves` are boundaries because of where they run; 1 is neutral.
 
-    def odds(self, curves: Sequence[Curve]) -> FloatArray:
-        """How many times likelier (N,) `curves` are boundaries because of where they run: 1 where that tells nothing.
-
-        Elsewhere on a road there is a boundary every lane width, rather whole lanes away than between. The ego lane has
-        one where each of its own was seen, give or take the spread with the heavy tail of Student's t of three degrees,
-        and none between them.
+        Roads have a boundary every lane width. The ego lane has one where the prior saw it, within its deviation (with
+        the heavy tail of Student's t with three degrees of freedom), and none between its own two.
         """
         below = _COMPARED * self.view.depth
         rows = self.view.horizon + below
-        places = curve_columns(curves, rows) / below
-        away = [(places - boundary.curve.x(rows) / below) / boundary.spread for boundary in self.seen]
+        places = curves.x(rows) / below
+        mine = self.curves.x(rows) / below
+        distance = (places[:, None] - mine) / self.sigma
         odds = np.ones(len(curves))
-        if len(away) == 2:
-            within = np.minimum(away[0].mean(axis=1), -away[1].mean(axis=1))
-            left, right = (float((boundary.curve.x(rows) / below).mean()) for boundary in self.seen)
-            lattice = LaneSpacing(left, right, least=_OFF_LATTICE)
-            odds = _REPEATED * lattice.trust(places.mean(axis=1)) / (1.0 + np.exp(within.clip(-30.0, 30.0)))
-        for boundary, off in zip(self.seen, away, strict=True):
-            density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (off**2).mean(axis=1) / 3.0) ** 2 / boundary.spread.mean()
-            odds += boundary.presence * USUAL_WIDTH * density
-        return odds
+        if len(mine) == 2:
+            inside = np.minimum(distance[:, 0].mean(axis=1), -distance[:, 1].mean(axis=1))
+            left, right = mine.mean(axis=1).tolist()
+            spacing = LaneSpacing(left, right, _UNSPACED_SHARE)
+            odds = _SPACED_ODDS * spacing.weight(places.mean(axis=1)) / (1.0 + np.exp(inside.clip(-30.0, 30.0)))
+        density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (distance**2).mean(axis=2) / 3.0) ** 2 / self.sigma.mean(axis=1)
+        return np.asarray(odds + USUAL_LANE_WIDTH * density @ self.presence)
 
 
 @dataclass(frozen=True)
-class EgoPriorEstimator:
-    """The regressor as a source of priors: `detector` makes its input, `network` answers."""
+class LaneSpacing:
+    """The lane-spacing model: boundaries repeat every lane width beside the ego lane's `left` and `right`.
 
-    detector: RegressionDetector
-    network: Network
+    All are lateral positions in columns per row offset. A line between such positions has the weight `least`.
+    """
 
-    def look(self, image: Image, horizon: float | None = None, followed: Sequence[Curve] = ()) -> Steps[EgoPrior]:
-        """The prior for a BGR image (H, W, 3); `horizon` is about its row, where known.
+    left: float
+    right: float
+    least: float
 
-        Beneath boundaries that are `followed` already, curves in image pixels, no paint is looked for.
+    # A line so many lane widths off a boundary's position has most of its weight left; lanes beyond the next ones
+    # count less, since roads widen and end.
+    _TOLERANCE = 0.12
+    _OUTER_WEIGHT = 0.6
+    # The width of the ego lane, if it is a lane at all.
+    _WIDTHS = (1.2, 4.5)
+
+    @property
+    def width(self) -> float:
+        """The lane width, limited to what lanes are."""
+        narrowest, widest = self._WIDTHS
+        return min(max(self.right - self.left, narrowest), widest)
+
+    @property
+    def neighbors(self) -> FloatArray:
+        """The next boundaries outside the ego lane, left and right (2,)."""
+        return np.array([self.left - self.width, self.right + self.width])
+
+    def weight(self, places: FloatArray) -> FloatArray:
+        """Returns how likely lines at lateral `places` (N,) are boundaries, 0 to 1, judged by their positions alone."""
+        is_left = places < 0.5 * (self.left + self.right)
+        outside = np.where(is_left, self.left - places, places - self.right) / self.width
+        lanes = np.maximum(0.0, np.rint(outside))
+        near = np.exp(-0.5 * ((outside - lanes) / self._TOLERANCE) ** 2)
+        weight: FloatArray = (self.least + (1.0 - self.least) * near) * np.where(lanes <= 1.0, 1.0, self._OUTER_WEIGHT)
+        return weight
+
+
+@dataclass(frozen=True)
+class RoadRegressor:
+    """Prepares the regressor's inputs and reads its outputs.
+
+    A boundary is reported from the presence `threshold` on.
+    """
+
+    threshold: float
+    geometry: RoadCropGeometry = RoadCropGeometry()
+
+    def predict(self, image: Image, horizon: float | None, infer: Infer) -> tuple[RegressorOutput, RoadView]:
+        """Returns the output for a BGR working image, and the view with the horizon that the network sees.
+
+        `horizon` is about its row. If it is None the network tries several, and looks again where it was most certain.
         """
-        reading, seen = yield from self._reading(image, horizon)
-        if abs(reading.horizon) > _SECOND_LOOK:
-            reading, seen = yield from self._reading(image, seen.horizon)
-        new = [side for side in (0, 1) if not _is_followed(reading.curve(side, seen), followed, seen)]
-        fits, _ = self.detector.fitted(image, reading, seen, new)
-        left, right = (self._seen(reading, side, seen, fits.get(side)) for side in (0, 1))
-        return EgoPrior(seen, left, right)
+        height, width = image.shape[:2]
+        detail = resized(image, self.geometry.detail_width / width)
+        if horizon is None:
+            views = [RoadView(width, height, share * height) for share in UNKNOWN_HORIZONS]
+            crops = np.stack([self.crop(detail, view) for view in views])
+            outputs = [RegressorOutput.of(row) for row in infer("regressor", crops)]
+            best = min(range(len(views)), key=lambda i: outputs[i].uncertainty)
+            horizon = outputs[best].view(views[best]).horizon
+        view = RoadView(width, height, float(np.clip(horizon, 0.0, 0.85 * height)))
+        crop = self.crop(detail, view)
+        # The network's errors differ between a crop and its mirror image, so their mean is the better estimate.
+        straight, mirrored = infer("regressor", np.stack([crop, crop[:, ::-1]]))
+        output = RegressorOutput.of(straight).mean(RegressorOutput.of(mirrored).mirrored)
+        return output, output.view(view)
 
-    def _seen(self, reading: RegressorOutput, side: int, view: RoadView, fit: Fit | None) -> PriorBoundary | None:
-        presence = float(reading.presence[side])
-        if presence < self.detector.threshold or reading.deviations[side].mean() > _MOST_DOUBT:
-            return None
-        curve = reading.curve(side, view)
-        spread = np.hypot(reading.deviations[side, : len(_COMPARED)] * view.width / (_COMPARED * view.depth), _EXACT)
-        return PriorBoundary(curve, spread, presence, None if fit is None else fit.curve)
+    def crop(self, detail: Image, view: RoadView) -> NDArray[np.uint8]:
+        """Returns the road crop (size, size, 3) in RGB of `detail`, the working image reduced to the geometry's `detail_width`."""
+        factor = np.float32(detail.shape[1] / view.width)
+        columns, rows = ((places + np.float32(0.5)) * factor - np.float32(0.5) for places in self.geometry.grid(view))
+        crop = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
-    def _reading(self, image: Image, horizon: float | None) -> Steps[tuple[RegressorOutput, RoadView]]:
-        prepared = self.detector.prepare(image, horizon)
-        return self.detector.read(prepared, (yield Question(self.network, prepared.inputs)))
+    def prior(self, output: RegressorOutput, view: RoadView) -> EgoPrior:
+        """Returns the boundaries of an output that are present and certain enough to search around."""
+        seen = (output.presence >= self.threshold) & (output.sigma.mean(axis=1) <= _MOST_UNCERTAIN)
+        sigma = output.sigma[seen, : len(_COMPARED)] * view.width / (_COMPARED * view.depth)
+        sides = _sides(seen.tolist())
+        return EgoPrior(view, sides, output.curves(view).take(seen), np.hypot(sigma, _LEAST_SIGMA), output.presence[seen])
 
 
-def _is_followed(curve: Curve, followed: Sequence[Curve], view: RoadView) -> bool:
-    """Whether it runs where one of the `followed` curves does."""
-    below = _COMPARED * view.depth
-    rows = view.horizon + below
-    near = _FOLLOWED * below * np.hypot(1.0, curve.slope(rows))
-    return any(bool((np.abs(other.x(rows) - curve.x(rows)) < near).all()) for other in followed)
+def _sides(seen: Sequence[bool]) -> tuple[int, ...]:
+    return tuple(side for side, is_seen in zip((-1, 1), seen, strict=True) if is_seen)

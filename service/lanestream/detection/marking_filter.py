@@ -1,14 +1,14 @@
-"""Ridges of a road: the centres of narrow bright bars, which markings are, row by row.
+"""The marking filter: finds narrow bright bars between darker sides, which is what painted markings are, row by row.
 
-Seen along the boundaries of a perspective, a flat road has constant lane widths and constant marking widths. So the
-road is unrolled to (row, slope) once; there every marking is a bar of known width and a box filter finds it, even where
-dashes and dots leave too few edges. Under a perspective that is a little wrong bars lean, but are as wide.
+It runs on images whose rows are resampled in proportion to their row offset, so that a marking is equally wide in every
+row: on the road unrolled around its vanishing point, and on strips along single curves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
@@ -18,12 +18,28 @@ from lanestream.road.curve import FloatArray
 from lanestream.road.view import Image
 
 if TYPE_CHECKING:
-    from lanestream.detection.perspective import Perspective
+    from lanestream.detection.vanishing_point import VanishingPoint
+
+# The unrolled road: lateral positions up to this far on both sides in steps of STEP, on ROWS rows from TOP_SHARE of the
+# depth down to the bottom. Lateral positions are in columns per row offset: meters over the camera's height.
+REACH: Final = 6.5
+STEP: Final = 0.02
+ROWS: Final = 72
+TOP_SHARE: Final = 0.08
+
+# Markings are about as wide as one of these.
+_WIDTHS: Final = (0.06, 0.12)
+# Contrast is relative to the road's own texture, which has about 1. A ridge has at least the first; none is more certain
+# than at the second.
+_LEAST_CONTRAST: Final = 0.5
+_FULL_CONTRAST: Final = 3.0
+# Ridges of one row are at least this far apart.
+_SEPARATION: Final = 0.14
 
 
 @dataclass(frozen=True)
 class Ridges:
-    """Columns `x` and rows `y` (N,) of ridges in pixels, strongest first, and their `weight` (0 to 1) by contrast.
+    """Centers of bright bars: columns `x` and rows `y` (N,) in pixels, strongest first, with `weight` (N,), 0 to 1.
 
     `rows` are all rows that were searched.
     """
@@ -34,57 +50,48 @@ class Ridges:
     rows: FloatArray
 
     def strongest(self, number: int) -> Ridges:
-        """The first `number` of them."""
+        """Returns the first `number` ridges."""
         return Ridges(self.x[:number], self.y[:number], self.weight[:number], self.rows)
 
 
-@dataclass(frozen=True)
-class RidgeSearch:
-    """The search's settings; widths are slopes, columns a row, which on a flat road are metres over camera heights.
+def bar_contrast(image: NDArray[Any], widths: Sequence[int], gap: float = 0.0) -> NDArray[np.float32]:
+    """Returns how much brighter a bar centered at each pixel is than the brighter of its two sides.
 
-    The road is unrolled to `reach` on both sides in steps of `step`, on `rows` rows from `top_share` of the depth down
-    to the bottom. Markings are about as wide as one of `widths`. `least` is the contrast from which on there is a
-    ridge, `most` the one that no ridge can be surer than; the road's own unrest has a contrast of about 1.
+    `image` is (R, C); bars and sides are one of the `widths` in pixels (odd), with `gap` widths between them. Of several
+    widths the highest contrast counts. Beyond the left and right border the last pixel repeats.
     """
+    best: NDArray[np.float32] | None = None
+    for width in widths:
+        offset = width + int(gap * width)
+        mean = cv2.boxFilter(image, cv2.CV_32F, (width, 1))
+        padded = cv2.copyMakeBorder(mean, 0, 0, offset, offset, cv2.BORDER_REPLICATE)
+        contrast = mean - np.maximum(padded[:, : -2 * offset], padded[:, 2 * offset :])
+        best = contrast if best is None else np.maximum(best, contrast, out=best)
+    assert best is not None  # noqa: S101 - widths are never empty
+    return best
 
-    reach: float = 6.5
-    step: float = 0.02
-    rows: int = 72
-    top_share: float = 0.08
-    widths: tuple[float, ...] = (0.06, 0.12)
-    least: float = 0.5
-    most: float = 3.0
 
-    def find(self, grey: Image, guess: Perspective) -> Ridges:
-        """The ridges of a grey working image (H, W) whose perspective is about `guess`."""
-        height, width = grey.shape
-        rows = np.linspace(guess.y + self.top_share * (height - 1.0 - guess.y), height - 1.0, self.rows)
-        slopes = np.arange(-self.reach, self.reach + self.step / 2, self.step)
-        columns = guess.columns(slopes, rows, height - 1.0).astype(np.float32)
-        places = np.repeat(rows.astype(np.float32)[:, None], len(slopes), axis=1)
-        road = cv2.remap(grey, columns, places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        contrast = self._contrast(np.asarray(road, np.uint8))
-        highest = cv2.dilate(contrast, np.ones((1, self._cells(0.14)), np.uint8))
-        row, cell = np.nonzero((contrast == highest) & (contrast > self.least))
-        strength, x, y = contrast[row, cell], columns[row, cell].astype(float), rows[row]
-        order = np.argsort(-strength, kind="stable")
-        order = order[(x[order] >= 0.0) & (x[order] <= width - 1.0)]
-        weight = np.minimum(strength[order].astype(float) / self.most, 1.0)
-        return Ridges(x[order], y[order], weight, rows)
+def find_ridges(gray: Image, point: VanishingPoint) -> Ridges:
+    """Returns the ridges of a gray working image (H, W), whose road has about the vanishing point `point`."""
+    height, width = gray.shape
+    rows = np.linspace(point.y + TOP_SHARE * (height - 1.0 - point.y), height - 1.0, ROWS)
+    places = np.arange(-REACH, REACH + STEP / 2, STEP)
+    columns = point.columns(places, rows).astype(np.float32)
+    row_map = np.repeat(rows.astype(np.float32)[:, None], len(places), axis=1)
+    road = np.asarray(cv2.remap(gray, columns, row_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    texture = cv2.absdiff(road, cv2.blur(road, (_cells(0.5), 1)))
+    around = cv2.boxFilter(texture, cv2.CV_32F, (_cells(2.0), 9)) + 6.0
+    contrast = bar_contrast(road, [_cells(width) for width in _WIDTHS], gap=0.5) / around
+    highest = cv2.dilate(contrast, np.ones((1, _cells(_SEPARATION)), np.uint8))
+    inside = (columns >= 0.0) & (columns <= width - 1.0)
+    row, cell = np.nonzero((contrast == highest) & (contrast > _LEAST_CONTRAST) & inside)
+    strength = contrast[row, cell]
+    order = np.argsort(-strength, kind="stable")
+    row, cell = row[order], cell[order]
+    weight = np.minimum(strength[order].astype(float) / _FULL_CONTRAST, 1.0)
+    return Ridges(columns[row, cell].astype(float), rows[row], weight, rows)
 
-    def _contrast(self, road: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """How much brighter bars are than the brighter one of their neighbours, over the unrest around (row, slope)."""
-        unrest = cv2.absdiff(road, cv2.blur(road, (self._cells(0.5), 1)))
-        around = cv2.boxFilter(unrest, cv2.CV_32F, (self._cells(2.0), 9)) + 6.0
-        best = np.zeros(road.shape, np.float32)
-        for width in self.widths:
-            cells = self._cells(width)
-            side = cells + cells // 2
-            mean = cv2.boxFilter(road, cv2.CV_32F, (cells, 1))
-            darker = mean[:, side:-side] - np.maximum(mean[:, : -2 * side], mean[:, 2 * side :])
-            np.maximum(best[:, side:-side], darker, out=best[:, side:-side])
-        return np.asarray(best / around, np.float32)
 
-    def _cells(self, width: float) -> int:
-        """A width in cells, odd so that it has a middle."""
-        return round(width / self.step) | 1
+def _cells(width: float) -> int:
+    """Returns a width in cells of the unrolled road, odd so that it has a middle."""
+    return round(width / STEP) | 1

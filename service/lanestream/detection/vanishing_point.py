@@ -1,94 +1,252 @@
-"""The vanishing point of a frame's lines: where the road ends, and with it the horizon."""
+"""The vanishing point and curvature that all boundaries of a road share, and the lines through it.
+
+On a flat road of constant curvature every boundary is x(y) = v + b u + k / u with u = y - h: v, h and k belong to the
+road, b to the boundary (the hyperbola-pair model: K. Kluge, "Extracting road curvature and orientation from image edge
+points without perceptual grouping into features", 1994). With the right v, h and k the ridges of all markings gather at
+a few values of b. So the three are searched for by how sharply the ridges gather, and the lines are the peaks.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.hough import HoughLines
+from lanestream.detection.marking_filter import REACH, STEP, Ridges
+from lanestream.road.curve import Curves, FloatArray
 
 
 @dataclass(frozen=True)
 class VanishingPoint:
-    """A point (x, y) of the working image and how much speaks for it, from 0 (a guess) to 1."""
+    """The vanishing point (`x`, `y`) and the curvature term `k` of the road, in pixels.
+
+    `weight` (0 to 1) is the share of the frame's lines that supports it.
+    """
 
     x: float
     y: float
-    weight: float
+    k: float = 0.0
+    weight: float = 0.0
+
+    def columns(self, places: FloatArray, rows: FloatArray) -> FloatArray:
+        """Returns the columns (R, P) of boundaries with the lateral positions b = `places` (P,) at `rows` (R,)."""
+        u = np.maximum(rows - self.y, 1.0)[:, None]
+        columns: FloatArray = (self.x + self.k / u) + u * places
+        return columns
+
+    def places(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
+        """Returns the lateral positions b (N,) of the boundaries through the points (`columns`, `rows`), each (N,)."""
+        u = np.maximum(rows - self.y, 1.0)
+        places: FloatArray = (columns - self.x - self.k / u) / u
+        return places
+
+    def curves(self, places: FloatArray) -> Curves:
+        """Returns the boundaries with the lateral positions b = `places` (N,)."""
+        coefficients = np.empty((len(places), 3))
+        coefficients[:, 0], coefficients[:, 1], coefficients[:, 2] = self.x, places, self.k
+        return Curves(self.y, coefficients)
+
+
+# --- From Hough lines, if nothing else says where the road vanishes -----------------------------------------------------
+
+# A line supports a point with a Cauchy weight of its distance in these image widths.
+_TOLERANCE: Final = 0.012
+# The horizon's row as a fraction of the height: its limits, where cameras usually have it, and the standard deviation.
+_HIGHEST, _LOWEST, _USUAL, _SPREAD = 0.2, 0.72, 0.46, 0.16
+_GRID_COLUMNS: Final = 80
+
+
+def vote_of_lines(lines: HoughLines, width: int, height: int, horizon: float | None = None) -> VanishingPoint:
+    """Returns the vanishing point of `lines` in a `width` x `height` image, on the row `horizon` if that is known.
+
+    All lines vote over a grid of points; weighted least squares then refines the winner.
+    """
+    if len(lines) < 2:
+        return VanishingPoint((width - 1) / 2.0, _USUAL * height if horizon is None else horizon)
+    step = width / _GRID_COLUMNS
+    columns = np.arange(0.1 * width, 0.9 * width, step)
+    rows = np.arange(_HIGHEST * height, _LOWEST * height, step) if horizon is None else np.array([horizon])
+    support = _support(lines, columns, rows, width, height - 1.0)
+    usual = ((columns / width - 0.5) / 0.25)[None, :] ** 2
+    if horizon is None:
+        usual = usual + ((rows / height - _USUAL) / _SPREAD)[:, None] ** 2
+    score = support + 0.15 * lines.votes.sum() * np.exp(-0.5 * usual)
+    best = np.unravel_index(int(np.argmax(score)), score.shape)
+    x, y = float(columns[best[1]]), float(rows[best[0]])
+    weight = float(np.clip(2.0 * support[best] / lines.votes.sum(), 0.0, 1.0))
+    for _ in range(3):
+        x, y = _least_squares_step(lines, x, y, width, height - 1.0, horizon is not None)
+    y = float(np.clip(y, _HIGHEST * height, _LOWEST * height))
+    return VanishingPoint(float(np.clip(x, 0.0, width - 1.0)), y, 0.0, weight)
+
+
+def _support(lines: HoughLines, columns: FloatArray, rows: FloatArray, width: int, bottom: float) -> FloatArray:
+    """Returns the votes (R, C) for each point of the grid.
+
+    Lines from both sides of the road must support a point, or parallel lines would win.
+    """
+    at_rows = lines.x_bottom[None, :] + lines.slope[None, :] * (rows[:, None] - bottom)
+    scale = _TOLERANCE * width * np.hypot(1.0, lines.slope)
+    distance = (columns[None, :, None] - at_rows[:, None, :]) / scale
+    kernel = lines.votes / (1.0 + distance**2)
+    left = lines.x_bottom[None, None, :] < columns[None, :, None]
+    on_left = (kernel * left).sum(axis=2)
+    on_right = (kernel * ~left).sum(axis=2)
+    support: FloatArray = np.maximum(on_left, on_right) * 0.35 + np.minimum(on_left, on_right) * 1.65
+    return support
+
+
+def _least_squares_step(
+    lines: HoughLines, x: float, y: float, width: int, bottom: float, row_known: bool
+) -> tuple[float, float]:
+    """Returns the point after one reweighted least-squares step towards where all supporting lines meet."""
+    residual = lines.x_bottom + lines.slope * (y - bottom) - x
+    norm = np.hypot(1.0, lines.slope)
+    distance = residual / norm / (_TOLERANCE * width)
+    weight = lines.votes / (1.0 + distance**2) ** 2 / norm**2
+    if row_known:
+        return x + float((weight * residual).sum() / (weight.sum() + 1e-9)), y
+    # Minimize sum w (residual + slope dy - dx)^2, damped so that parallel lines do not move the point far away.
+    design = np.stack([np.ones(len(lines)), -lines.slope], axis=1)
+    normal = design.T @ (design * weight[:, None]) + np.eye(2) * 1e-3 * weight.sum()
+    move = np.linalg.solve(normal, design.T @ (weight * residual))
+    limit = 0.03 * width
+    return x + float(np.clip(move[0], -limit, limit)), y + float(np.clip(move[1], -limit, limit))
+
+
+# --- Refined by the ridges ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class VanishingPointSearch:
-    """A vote of all lines over a grid of points, then a weighted least-squares step at the winner.
+class SearchRange:
+    """How far around a first guess the vanishing point and the curvature are searched for.
 
-    A line supports a point with a Cauchy weight of its distance in units of `tolerance` image widths. The prior says
-    that cameras look about ahead: the horizon lies near `middle` of the height, give or take `spread`.
+    `x` and `y` are in image widths, `curvature` in depths (k over the squared depth). Each of `rounds` (number, share)
+    tries so many values of all three within this share of the range around the best ones so far, on the strongest
+    `ridges`.
     """
 
-    tolerance: float = 0.012
-    lowest: float = 0.72
-    highest: float = 0.2
-    middle: float = 0.46
-    spread: float = 0.16
+    x: float
+    y: float
+    curvature: float
+    ridges: int
+    rounds: tuple[tuple[int, float], ...]
 
-    def find(self, lines: HoughLines, width: int, height: int, horizon: float | None = None) -> VanishingPoint:
-        """The vanishing point of `lines` in a `width` x `height` image; on the row `horizon` where that is known."""
-        if len(lines) < 2:
-            return VanishingPoint((width - 1) / 2.0, self._row(height, horizon), 0.0)
-        step = width / 80.0
-        columns = np.arange(0.1 * width, 0.9 * width, step)
-        rows = np.arange(self.highest * height, self.lowest * height, step) if horizon is None else np.array([horizon])
-        support = self._support(lines, columns, rows, width, height - 1.0)
-        score = support + 0.15 * lines.votes.sum() * self._prior(columns, rows, width, height, horizon is not None)
-        best = np.unravel_index(int(np.argmax(score)), score.shape)
-        x, y = float(columns[best[1]]), float(rows[best[0]])
-        weight = float(np.clip(2.0 * support[best] / lines.votes.sum(), 0.0, 1.0))
-        for _ in range(3):
-            x, y = self._step(lines, x, y, width, height - 1.0, horizon is not None)
-        y = float(np.clip(y, self.highest * height, self.lowest * height))
-        return VanishingPoint(float(np.clip(x, 0.0, width - 1.0)), y, weight)
 
-    def _row(self, height: int, horizon: float | None) -> float:
-        return self.middle * height if horizon is None else horizon
+WIDE: Final = SearchRange(0.12, 0.1, 0.06, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
+# If the horizon is known, its row is at most a pitch movement of the vehicle away.
+KNOWN_HORIZON: Final = SearchRange(0.12, 0.02, 0.06, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
+NEAR_PRIOR: Final = SearchRange(0.03, 0.01, 0.015, 300, ((3, 0.7), (3, 0.35), (3, 0.12)))
 
-    def _prior(
-        self, columns: NDArray[np.float64], rows: NDArray[np.float64], width: int, height: int, known: bool
-    ) -> NDArray[np.float64]:
-        across = ((columns / width - 0.5) / 0.25) ** 2
-        down = np.zeros(len(rows)) if known else ((rows / height - self.middle) / self.spread) ** 2
-        prior: NDArray[np.float64] = np.exp(-0.5 * (across[None, :] + down[:, None]))
-        return prior
+# Ridges gather in cells of this many image widths on the bottom row, up to so many image widths from the middle.
+_CELL: Final = 0.012
+_CELLS_REACH: Final = 3.0
+# The share of the best score that a hypothesis at the end of its range must make up for.
+_PRIOR_PENALTY: Final = 0.15
+_FEWEST_RIDGES: Final = 8
 
-    def _support(
-        self, lines: HoughLines, columns: NDArray[np.float64], rows: NDArray[np.float64], width: int, bottom: float
-    ) -> NDArray[np.float64]:
-        """Votes for each point of the grid; both ways of leaning must speak for it, or parallels would win."""
-        at_rows = lines.x_bottom[None, :] + lines.slope[None, :] * (rows[:, None] - bottom)
-        scale = self.tolerance * width * np.hypot(1.0, lines.slope)
-        distance = (columns[None, :, None] - at_rows[:, None, :]) / scale
-        kernel = lines.votes / (1.0 + distance**2)
-        # A line that stands left of the point at the bottom belongs to the left half of the road.
-        left = lines.x_bottom[None, None, :] < columns[None, :, None]
-        on_left = (kernel * left).sum(axis=2)
-        on_right = (kernel * ~left).sum(axis=2)
-        support: NDArray[np.float64] = np.maximum(on_left, on_right) * 0.35 + np.minimum(on_left, on_right) * 1.65
-        return support
 
-    def _step(
-        self, lines: HoughLines, x: float, y: float, width: int, bottom: float, known: bool
-    ) -> tuple[float, float]:
-        """One reweighted least-squares step towards the point that all supporting lines pass through."""
-        residual = lines.x_bottom + lines.slope * (y - bottom) - x
-        norm = np.hypot(1.0, lines.slope)
-        distance = residual / norm / (self.tolerance * width)
-        weight = lines.votes / (1.0 + distance**2) ** 2 / norm**2
-        if known:
-            return x + float((weight * residual).sum() / (weight.sum() + 1e-9)), y
-        # Minimise sum w (residual + slope dy - dx)^2, damped so that parallel lines do not send it away.
-        design = np.stack([np.ones(len(lines)), -lines.slope], axis=1)
-        normal = design.T @ (design * weight[:, None]) + np.eye(2) * 1e-3 * weight.sum()
-        move = np.linalg.solve(normal, design.T @ (weight * residual))
-        limit = 0.03 * width
-        return x + float(np.clip(move[0], -limit, limit)), y + float(np.clip(move[1], -limit, limit))
+def refine(guess: VanishingPoint, ridges: Ridges, width: int, bottom: float, search: SearchRange) -> VanishingPoint:
+    """Returns `guess` moved to where `ridges` gather most sharply, coarse to fine."""
+    if len(ridges.x) < _FEWEST_RIDGES:
+        return guess
+    ridges = ridges.strongest(search.ridges)
+    spread = np.array([search.x * width, search.y * width, search.curvature])
+    start = np.array([guess.x, guess.y, guess.k / (bottom - guess.y) ** 2])
+    best = start
+    for steps, share in search.rounds:
+        axes = best[:, None] + np.linspace(-share, share, steps) * spread[:, None]
+        score = _sharpness(axes, ridges, width, bottom)
+        x, y, curvature = ((axes - start[:, None]) / spread[:, None]) ** 2
+        distance = x[:, None, None] + y[:, None] + curvature
+        index = np.unravel_index(int(np.argmax(score - _PRIOR_PENALTY * score.max() * distance)), score.shape)
+        best = axes[np.arange(3), index]
+    x, y, curvature = best.tolist()
+    return VanishingPoint(x, y, curvature * (bottom - y) ** 2, guess.weight)
+
+
+def _sharpness(axes: FloatArray, ridges: Ridges, width: int, bottom: float) -> NDArray[np.float32]:
+    """Returns how sharply the ridges gather for each hypothesis: the variance of a histogram about its smooth self.
+
+    `axes` (3, S) are the hypotheses' x, y and curvatures; the result is (S, S, S). The histogram counts where the
+    boundaries through the ridges cross the bottom row. Scattered points give the same variance however far a hypothesis
+    draws them together, so a high horizon has no advantage.
+    """
+    # Single precision: a hundredth of a pixel on the bottom row, in half the time.
+    x, y, curvature = axes.astype(np.float32)
+    depth = np.float32(bottom) - y[:, None]
+    nearness = depth / np.maximum(ridges.y.astype(np.float32) - y[:, None], np.float32(4.0))
+    # A ridge crosses at x + (x_r - x - curvature depth n) n: one term with x, another with the curvature.
+    with_x = x[:, None, None] * (np.float32(1.0) - nearness) + ridges.x.astype(np.float32) * nearness
+    with_curvature = curvature[:, None] * (depth * nearness**2)[:, None]
+    per_cell = np.float32(1.0 / (_CELL * width))
+    cells = int(2 * _CELLS_REACH / _CELL)
+    first = with_x * per_cell + np.float32((_CELLS_REACH - 0.5) / _CELL + 1.0)
+    crossing = first[:, :, None] - with_curvature * per_cell
+    # A cell at either end takes what lies beyond.
+    np.clip(crossing, 0.0, np.float32(cells + 1), out=crossing)
+    cell = crossing.astype(np.int32).reshape(axes.shape[1] ** 3, -1)
+    cell += np.arange(len(cell), dtype=np.int32)[:, None] * (cells + 2)
+    weight = np.broadcast_to(ridges.weight, cell.shape)
+    counts = np.bincount(cell.ravel(), weight.ravel(), minlength=len(cell) * (cells + 2))
+    counts = counts.reshape(len(cell), cells + 2)[:, 1:-1].astype(np.float32)
+    sharp = cv2.blur(counts, (2, 1)) - cv2.blur(counts, (31, 1))
+    sharpness: NDArray[np.float32] = np.einsum("ij,ij->i", sharp, sharp)
+    return sharpness.reshape((axes.shape[1],) * 3)
+
+
+# --- Lines through it --------------------------------------------------------------------------------------------------
+
+# A ridge votes for lines this near; two lines are at least so far apart. Both are lateral positions, as `b` is.
+_VOTE_WIDTH: Final = 0.08
+_SEPARATION: Final = 0.16
+_MOST_LINES: Final = 24
+
+
+@dataclass(frozen=True)
+class FoundLines:
+    """Lines through the vanishing point: lateral positions `places` (N,) and `strength` (N,) in ridges per row.
+
+    The strongest comes first.
+    """
+
+    places: FloatArray
+    strength: FloatArray
+
+
+def find_lines(ridges: Ridges, point: VanishingPoint, width: int) -> FoundLines:
+    """Returns the strongest lines through `point` in an image `width` pixels wide.
+
+    This is a Hough transform in one dimension: each ridge votes for the one lateral position it would belong to. It
+    gathers what dashes and dots leave over all rows.
+    """
+    cells = np.arange(-REACH, REACH + STEP / 2, STEP)
+    votes = _votes(point.places(ridges.x, ridges.y), ridges.weight, len(cells))
+    # Short stretches near the image's side would win on a few rows, so the mean includes rows without anything.
+    profile = votes / (_visible_rows(cells, ridges.rows, point, width) + 0.2 * len(ridges.rows))
+    window = 2 * max(1, round(_SEPARATION / STEP / 2)) + 1
+    highest = cv2.dilate(profile.reshape(1, -1), np.ones((1, window), np.uint8)).ravel()
+    peaks = np.flatnonzero((profile == highest) & (profile > 0.0))
+    order = peaks[np.argsort(-profile[peaks], kind="stable")[:_MOST_LINES]]
+    return FoundLines(cells[order], profile[order])
+
+
+def _votes(places: FloatArray, weight: FloatArray, cells: int) -> FloatArray:
+    """Returns a smooth histogram (cells,) of the ridges' lateral positions, each counted in its two nearest cells."""
+    position = np.clip((places + REACH) / STEP, 0.0, cells - 1.001)
+    cell = position.astype(int)
+    # Squared: a few bright dots count for more than a wheel track that is a little lighter all along.
+    right = (position - cell) * weight**2
+    counts = np.bincount(cell, weight**2 - right, cells) + np.bincount(cell + 1, right, cells)
+    return np.convolve(counts, np.hanning(2 * round(_VOTE_WIDTH / STEP) + 1), mode="same")
+
+
+def _visible_rows(places: FloatArray, rows: FloatArray, point: VanishingPoint, width: int) -> FloatArray:
+    """Returns in how many of `rows` the boundaries at `places` (N,), in ascending order, are inside the image."""
+    leftmost, rightmost = (np.sort(point.places(np.full(len(rows), x), rows)) for x in (0.0, width - 1.0))
+    visible = np.searchsorted(leftmost, places, "right") - np.searchsorted(rightmost, places, "left")
+    return np.asarray(visible, float)

@@ -1,8 +1,8 @@
-"""Questions of many cameras, answered together: one run at a time, each run takes what waits.
+"""The batcher: runs the inference requests of many cameras together, one batch at a time.
 
-The rule is work-conserving: when the device is free it takes what is there, up to the network's largest batch, and
-never waits for more, so that a lone camera pays nothing for the company it doesn't have. A camera has one question at a
-time, hence first come, first served is fair between cameras.
+It is work-conserving: when the device is free it runs what is waiting, up to the model's largest batch, and never waits
+for more. So a single camera does not pay for company that it does not have. A camera has one request at a time, hence
+first come, first served is fair between cameras.
 """
 
 from __future__ import annotations
@@ -14,19 +14,34 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Question
 from lanestream.errors import ExpiredError, LanestreamError
 
 _log = logging.getLogger(__name__)
 
 
+class RunnableModel(Protocol):
+    """What the batcher needs of a model; `lanestream.inference.loaded_model.LoadedModel` is one."""
+
+    @property
+    def name(self) -> str:
+        """The model's name and version."""
+
+    @property
+    def largest_batch(self) -> int:
+        """The most inputs of one run."""
+
+    def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Returns outputs (N, outputs) for inputs (N, size, size, 3)."""
+
+
 @dataclass(frozen=True)
-class Answer:
-    """A network's outputs, row by row, when the run that made them began and ended (monotonic seconds)."""
+class InferenceResult:
+    """A model's outputs (N, outputs), and when the run that computed them began and ended (monotonic seconds)."""
 
     outputs: NDArray[np.float32]
     started: float
@@ -34,128 +49,127 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
-class Waiting:
-    """A question on its way; after `deadline` (monotonic seconds) nobody wants its answer any more."""
+class InferenceRequest:
+    """Inputs (N, size, size, 3) for a model, and the future of its result.
 
-    question: Question
-    asked: float
+    After `deadline` (monotonic seconds) nobody needs the result.
+    """
+
+    model: RunnableModel
+    inputs: NDArray[np.uint8]
+    submitted: float
     deadline: float | None
-    answer: Future[Answer] = field(default_factory=Future)
-
-    @property
-    def rows(self) -> int:
-        """How many inputs it has."""
-        return len(self.question.inputs)
+    future: Future[InferenceResult] = field(default_factory=Future)
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """One run: its rows and questions, how many questions still waited, how long the oldest one of it had (seconds)."""
+    """One run: its model, inputs and requests, the requests still waiting, and the longest wait in it (seconds)."""
 
-    network: str
-    rows: int
-    questions: int
+    model: str
+    inputs: int
+    requests: int
     still_waiting: int
-    oldest_s: float
+    longest_wait_s: float
 
 
-class BatchQueue:
-    """What waits, in the order it came. Not thread-safe; reads no clock."""
+class RequestQueue:
+    """Waiting requests in the order of their arrival. Not thread-safe; reads no clock."""
 
     def __init__(self) -> None:
-        self._waiting: deque[Waiting] = deque()
+        self._waiting: deque[InferenceRequest] = deque()
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def add(self, waiting: Waiting) -> None:
-        """Takes in a question."""
-        self._waiting.append(waiting)
+    def add(self, request: InferenceRequest) -> None:
+        """Adds a request."""
+        self._waiting.append(request)
 
-    def take(self, now: float) -> tuple[list[Waiting], list[Waiting]]:
-        """The next batch, all of one network, and the questions that have expired before their turn.
+    def take(self, now: float) -> tuple[list[InferenceRequest], list[InferenceRequest]]:
+        """Removes and returns the next batch, all of one model, and the requests that have expired.
 
-        The oldest question chooses the network; what fits beside it in one run comes along, in order.
+        The oldest request chooses the model; later ones of that model join it, in order, while they fit.
         """
         expired = [each for each in self._waiting if each.deadline is not None and each.deadline < now]
-        kept = deque(each for each in self._waiting if each not in expired)
-        if not kept:
-            self._waiting = kept
+        valid = deque(each for each in self._waiting if each not in expired)
+        self._waiting = deque()
+        if not valid:
             return [], expired
-        network = kept[0].question.network
-        batch, rows = [kept.popleft()], 0
-        rows = batch[0].rows
-        left: deque[Waiting] = deque()
-        for each in kept:
-            if each.question.network is network and rows + each.rows <= network.buckets[-1]:
+        batch = [valid.popleft()]
+        model, inputs = batch[0].model, len(batch[0].inputs)
+        for each in valid:
+            if each.model is model and inputs + len(each.inputs) <= model.largest_batch:
                 batch.append(each)
-                rows += each.rows
+                inputs += len(each.inputs)
             else:
-                left.append(each)
-        self._waiting = left
+                self._waiting.append(each)
         return batch, expired
 
 
 @dataclass(frozen=True)
-class Turn:
-    """What one run is to answer, what has expired before it, and how many questions still wait."""
+class _Batch:
+    """The requests of one run, the ones that expired before it, and how many still wait."""
 
-    batch: list[Waiting]
-    expired: list[Waiting]
+    requests: list[InferenceRequest]
+    expired: list[InferenceRequest]
     still_waiting: int
 
 
 class Batcher:
-    """Answers questions, in a thread of its own or in that of who waits. `observe` is told of every run, where it was.
+    """Runs requests in its own thread, or in that of a caller who waits. `observe`, if given, gets every run's report.
 
-    It does not matter to a network which thread runs it, as long as it is one at a time.
+    A model may run in any thread, as long as only one runs at a time.
     """
 
     def __init__(self, observe: Callable[[BatchReport], None] | None = None) -> None:
         self._observe = observe
-        self._queue = BatchQueue()
+        self._queue = RequestQueue()
         self._changed = threading.Condition()
         self._running = False
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="lanestream-inference", daemon=True)
         self._thread.start()
 
-    def ask(self, question: Question, deadline: float | None = None) -> Future[Answer]:
-        """The answer to come; it fails with ExpiredError where `deadline` (monotonic seconds) passes before its run.
+    def submit(
+        self, model: RunnableModel, inputs: NDArray[np.uint8], deadline: float | None = None
+    ) -> Future[InferenceResult]:
+        """Returns the future result. It fails with ExpiredError if `deadline` (monotonic seconds) passes before the run.
 
         Raises RuntimeError after `close`.
         """
         with self._changed:
-            waiting = self._add(question, deadline)
+            request = self._add(model, inputs, deadline)
             if not self._running:
                 self._changed.notify()
-        return waiting.answer
+        return request.future
 
-    def answer(self, question: Question, deadline: float | None = None) -> Answer:
-        """The answer, for those who can do nothing without it: where nothing runs, they run what waits themselves.
+    def run(self, model: RunnableModel, inputs: NDArray[np.uint8], deadline: float | None = None) -> InferenceResult:
+        """Submits a request and waits for its result.
 
-        To wake another thread for it, and to be woken by that one, takes longer. Raises what `ask` says.
+        If no batch is running, the caller runs the waiting one itself: waking another thread and being woken by it
+        takes longer. Raises ExpiredError if `deadline` passes before the run, and RuntimeError after `close`.
         """
         with self._changed:
-            waiting = self._add(question, deadline)
-            turn = None if self._running else self._take()
-        if turn is not None:
-            self._run(turn)
-        return waiting.answer.result()
+            request = self._add(model, inputs, deadline)
+            batch = None if self._running else self._take()
+        if batch is not None:
+            self._run(batch)
+        return request.future.result()
 
     def close(self) -> None:
-        """Ends the thread after all that waits has been answered."""
+        """Ends the thread after all waiting requests have run."""
         with self._changed:
             self._closed = True
             self._changed.notify()
         self._thread.join()
 
-    def _add(self, question: Question, deadline: float | None) -> Waiting:
+    def _add(self, model: RunnableModel, inputs: NDArray[np.uint8], deadline: float | None) -> InferenceRequest:
         if self._closed:
             raise RuntimeError("the batcher is closed")
-        waiting = Waiting(question, time.monotonic(), deadline)
-        self._queue.add(waiting)
-        return waiting
+        request = InferenceRequest(model, inputs, time.monotonic(), deadline)
+        self._queue.add(request)
+        return request
 
     def _work(self) -> None:
         while True:
@@ -163,57 +177,52 @@ class Batcher:
                 self._changed.wait_for(lambda: not self._running and (self._closed or len(self._queue) > 0))
                 if not len(self._queue):
                     return
-                turn = self._take()
-            self._run(turn)
+                batch = self._take()
+            self._run(batch)
 
-    def _take(self) -> Turn:
-        """The next run, which is the caller's to do."""
+    def _take(self) -> _Batch:
+        """Returns the next batch, which the caller has to run."""
         self._running = True
-        batch, expired = self._queue.take(time.monotonic())
-        return Turn(batch, expired, len(self._queue))
+        requests, expired = self._queue.take(time.monotonic())
+        return _Batch(requests, expired, len(self._queue))
 
-    def _run(self, turn: Turn) -> None:
+    def _run(self, batch: _Batch) -> None:
         try:
-            for waiting in turn.expired:
-                _fail(waiting, ExpiredError())
-            # A caller that went away took its question with it; one whose run begins can't any more.
-            wanted = [waiting for waiting in turn.batch if waiting.answer.set_running_or_notify_cancel()]
+            for request in batch.expired:
+                _fail(request, ExpiredError())
+            # A caller that went away canceled its request; once the run has begun it can't any more.
+            wanted = [request for request in batch.requests if request.future.set_running_or_notify_cancel()]
             if wanted:
-                self._answer(wanted, turn.still_waiting)
+                self._run_requests(wanted, batch.still_waiting)
         finally:
             with self._changed:
                 self._running = False
                 if self._closed or len(self._queue):
                     self._changed.notify()
 
-    def _answer(self, batch: list[Waiting], still_waiting: int) -> None:
+    def _run_requests(self, requests: list[InferenceRequest], still_waiting: int) -> None:
         started = time.monotonic()
+        model = requests[0].model
+        inputs = [request.inputs for request in requests]
         try:
-            self._settle(batch, started)
+            outputs = model.run(inputs[0] if len(inputs) == 1 else np.concatenate(inputs))
         except Exception as error:
-            if len(batch) == 1:
-                batch[0].answer.set_exception(error)
+            if len(requests) == 1:
+                requests[0].future.set_exception(error)
             else:
-                _log.warning("a batch of %d questions failed, each is asked again alone: %s", len(batch), error)
-                for waiting in batch:
-                    self._answer([waiting], still_waiting)
+                _log.warning("a batch of %d requests failed, each runs again alone: %s", len(requests), error)
+                for request in requests:
+                    self._run_requests([request], still_waiting)
             return
-        if self._observe is not None:
-            rows = sum(waiting.rows for waiting in batch)
-            oldest = started - min(waiting.asked for waiting in batch)
-            network = batch[0].question.network.name
-            self._observe(BatchReport(network, rows, len(batch), still_waiting, oldest))
-
-    def _settle(self, batch: list[Waiting], started: float) -> None:
-        network = batch[0].question.network
-        inputs = [waiting.question.inputs for waiting in batch]
-        outputs = network.run(inputs[0] if len(inputs) == 1 else np.concatenate(inputs))
         ended = time.monotonic()
         parts = np.split(outputs, np.cumsum([len(part) for part in inputs])[:-1])
-        for waiting, part in zip(batch, parts, strict=True):
-            waiting.answer.set_result(Answer(part, started, ended))
+        for request, part in zip(requests, parts, strict=True):
+            request.future.set_result(InferenceResult(part, started, ended))
+        if self._observe is not None:
+            longest_wait = started - min(request.submitted for request in requests)
+            self._observe(BatchReport(model.name, len(outputs), len(requests), still_waiting, longest_wait))
 
 
-def _fail(waiting: Waiting, error: LanestreamError) -> None:
-    if waiting.answer.set_running_or_notify_cancel():
-        waiting.answer.set_exception(error)
+def _fail(request: InferenceRequest, error: LanestreamError) -> None:
+    if request.future.set_running_or_notify_cancel():
+        request.future.set_exception(error)

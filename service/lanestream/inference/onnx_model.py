@@ -1,11 +1,13 @@
-"""A network from an ONNX file, run by onnxruntime: on the CPU, on CUDA, or by TensorRT."""
+"""A network that onnxruntime runs: on the CPU, on CUDA, or by TensorRT."""
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import onnxruntime
@@ -14,16 +16,30 @@ from numpy.typing import NDArray
 from lanestream.errors import ModelError, ProviderError, one_line
 from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import ModelInfo, parse_info, require_file
-from lanestream.inference.providers import NAMES, OnnxProvider, preload_gpu_libraries, verify
+from lanestream.inference.providers import CPU, CUDA, DEFAULT_OPTIONS, ProviderSpec, RuntimeOptions
 from lanestream.processors import processors
-from lanestream.runtime import DEFAULT_OPTIONS, RuntimeOptions
 
-# The CPU takes any size at the same price, so that nothing is padded there, and gains nothing beyond some 8 at once.
-CPU_BUCKETS: Final = tuple(range(1, 17))
-# A GPU meets few shapes, and all of them before the first frame: it searches for its algorithms at each new one.
-GPU_BUCKETS: Final = (1, 2, 4, 8, 16, 32, 64)
+# On the CPU a batch of any size costs the same per input, so nothing is padded. Beyond 8 inputs nothing is gained, and
+# memory is lost: onnxruntime keeps what its largest batch needed.
+CPU_BATCH_SIZES: Final = tuple(range(1, 9))
+# A GPU gets few shapes, and all of them before the first frame: it searches for its algorithms at each new one.
+GPU_BATCH_SIZES: Final = (1, 2, 4, 8, 16, 32, 64)
 
-_CUDA_OPTIONS: Final = {"cudnn_conv_algo_search": "HEURISTIC", "arena_extend_strategy": "kSameAsRequested"}
+
+def load(
+    path: Path, spec: ProviderSpec = CPU, options: RuntimeOptions = DEFAULT_OPTIONS, reason: str = "it was requested"
+) -> OnnxModel:
+    """Loads the network in the file at `path` on the provider `spec`, whose build of onnxruntime is installed.
+
+    Raises ModelError if the file is not a model or does not describe itself, ProviderError if the provider does not
+    work.
+    """
+    require_file(path)
+    session = _gpu_session(path, spec, options) if spec.on_gpu else _cpu_session(path, options.threads)
+    verify_provider(spec, session.get_providers())
+    kind, sizes = (BoundOnnxModel, GPU_BATCH_SIZES) if spec.on_gpu else (OnnxModel, CPU_BATCH_SIZES)
+    threads = session.get_session_options().intra_op_num_threads
+    return kind(session, _info(session, path), Placement(spec.name, reason, threads, _nodes(session), sizes))
 
 
 class OnnxModel(LoadedModel):
@@ -34,36 +50,12 @@ class OnnxModel(LoadedModel):
         self._session = session
         self._input = session.get_inputs()[0].name
 
-    @classmethod
-    def load(
-        cls,
-        path: Path,
-        provider: OnnxProvider = "cpu",
-        options: RuntimeOptions = DEFAULT_OPTIONS,
-        reason: str = "it was asked for",
-    ) -> OnnxModel:
-        """The network in the file at `path`, on `provider`, whose build of onnxruntime is installed.
-
-        Raises ModelError for a file that is none or does not describe itself, ProviderError where `provider` can't be
-        had.
-        """
-        require_file(path)
-        if provider == "cpu":
-            session = _cpu_session(path, options.threads)
-            kind, buckets = OnnxModel, CPU_BUCKETS
-        else:
-            session = _gpu_session(path, provider, options)
-            kind, buckets = BoundOnnxModel, GPU_BUCKETS
-        verify(provider, session.get_providers())
-        threads = session.get_session_options().intra_op_num_threads
-        return kind(session, _info(session, path), Placement(provider, reason, threads, _nodes(session), buckets))
-
     def _outputs(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         return np.asarray(self._session.run(None, {self._input: inputs})[0], dtype=np.float32)
 
 
 class BoundOnnxModel(OnnxModel):
-    """A network on a device, with buffers there for each batch size: a run copies inputs in and outputs out."""
+    """A network on a device with buffers there for each batch size: a run copies inputs in and outputs out."""
 
     device = "cuda"
 
@@ -89,49 +81,57 @@ class BoundOnnxModel(OnnxModel):
         return self._bound.setdefault(shape[0], (binding, source, target))
 
 
+def preload_gpu_libraries() -> None:
+    """Loads CUDA and cuDNN from Python packages, where the system's loader does not look; problems go to stderr."""
+    with contextlib.redirect_stdout(sys.stderr):
+        onnxruntime.preload_dlls()
+
+
+def verify_provider(spec: ProviderSpec, running: list[str]) -> None:
+    """Raises ProviderError if a session for `spec` runs on another of onnxruntime's providers.
+
+    onnxruntime falls back silently, even with its fallback off: only the session itself shows it.
+    """
+    if running[0] != spec.onnxruntime_name:
+        raise ProviderError(
+            f"{spec.title} does not work: onnxruntime fell back to {running[0]}",
+            "check the driver and the libraries with `lanestream doctor`, or use the provider auto or cpu",
+        )
+
+
 def _cpu_session(path: Path, threads: int | None) -> Any:
     try:
         return onnxruntime.InferenceSession(
-            str(path), _session_options(threads), providers=[NAMES["cpu"]], enable_fallback=False
+            str(path), _session_options(threads), providers=[CPU.onnxruntime_name], enable_fallback=False
         )
     except Exception as error:  # onnxruntime raises a type per status, all of them private
         raise ModelError(
-            f"{path} is not a model that can be run: {one_line(error)}", "give an exported .onnx file"
+            f"{path} is not a model that can run: {one_line(error)}", "give an exported .onnx file"
         ) from error
 
 
-def _gpu_session(path: Path, provider: Literal["cuda", "tensorrt"], options: RuntimeOptions) -> Any:
-    # What is wrong with the file is told before the device is asked, and is not taken for its fault.
+def _gpu_session(path: Path, spec: ProviderSpec, options: RuntimeOptions) -> Any:
+    # A fault of the file is reported as one before the device is used, and not as the device's.
     info = _info(_cpu_session(path, 1), path)
     preload_gpu_libraries()
-    chosen = [(NAMES["cuda"], dict(_CUDA_OPTIONS))]
-    if provider == "tensorrt":
-        chosen.insert(0, (NAMES["tensorrt"], tensorrt_options(info, options.engine_cache)))
+    # What a provider cannot run goes to CUDA.
+    providers = [(each.onnxruntime_name, dict(each.options(info, options))) for each in dict.fromkeys((spec, CUDA))]
     try:
         return onnxruntime.InferenceSession(
-            str(path), _session_options(options.threads), providers=chosen, enable_fallback=False
+            str(path), _session_options(options.threads), providers=providers, enable_fallback=False
         )
     except Exception as error:
         raise ProviderError(
-            f"{provider} can't be used: {one_line(error)}",
+            f"{spec.name} does not work: {one_line(error)}",
             "check the driver and the libraries with `lanestream doctor`, or use the provider auto or cpu",
         ) from error
-
-
-def tensorrt_options(info: ModelInfo, cache: Path | None) -> dict[str, str]:
-    """TensorRT's options for a network: half precision for files in half precision alone, engines kept in `cache`."""
-    options = {"trt_fp16_enable": str(int(info.precision == "fp16"))}
-    if cache is not None:
-        options |= {"trt_engine_cache_enable": "1", "trt_engine_cache_path": str(cache)}
-        options |= {"trt_timing_cache_enable": "1", "trt_timing_cache_path": str(cache)}
-    return options
 
 
 def _session_options(threads: int | None) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or processors()
     options.log_severity_level = 3
-    # Threads that spin while they wait take the processors from those that decode and propose the next frame.
+    # Threads that spin while they wait take the processors from those that decode and search the next frame.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
     return options
@@ -142,9 +142,8 @@ def _info(session: Any, path: Path) -> ModelInfo:
 
 
 def _nodes(session: Any) -> Mapping[str, int]:
-    """How many nodes each execution provider runs, the most first."""
-    parts = session.get_provider_graph_assignment_info()
+    """Returns how many nodes each execution provider runs, the most first."""
     counts = Counter(dict.fromkeys(session.get_providers(), 0))
-    for part in parts:
+    for part in session.get_provider_graph_assignment_info():
         counts[part.ep_name] += len(part.get_nodes())
     return {name.removesuffix("ExecutionProvider"): count for name, count in counts.most_common()}

@@ -1,4 +1,4 @@
-"""A network from an ONNX file, run by OpenVINO on the CPU."""
+"""A network that OpenVINO runs on the CPU."""
 
 from __future__ import annotations
 
@@ -16,13 +16,43 @@ from numpy.typing import NDArray
 from lanestream.errors import ModelError, ProviderError, one_line
 from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import METADATA_KEY, ModelInfo, parse_info, require_file
+from lanestream.inference.providers import DEFAULT_OPTIONS, OPENVINO, ProviderSpec, RuntimeOptions
 from lanestream.processors import processors
-from lanestream.runtime import DEFAULT_OPTIONS, RuntimeOptions
 
-# A new batch size costs OpenVINO a few milliseconds once, and no size is dearer than another.
-BUCKETS: Final = tuple(range(1, 17))
+# A new batch size costs OpenVINO a few milliseconds once, and every size costs the same per input.
+_BATCH_SIZES: Final = tuple(range(1, 9))
 
 _TELEMETRY: Final = "openvino_telemetry"
+
+
+def load(
+    path: Path,
+    spec: ProviderSpec = OPENVINO,
+    options: RuntimeOptions = DEFAULT_OPTIONS,
+    reason: str = "it was requested",
+) -> OpenVinoModel:
+    """Loads the network in the file at `path` on the CPU.
+
+    Raises ModelError if the file is not a model or does not describe itself, ProviderError if OpenVINO does not work.
+    """
+    require_file(path)
+    openvino = import_openvino()
+    # Its reader of ONNX alone: the one that guesses the format complains about all others on stderr.
+    reader = openvino.frontend.FrontEndManager().load_by_framework("onnx")
+    try:
+        read = reader.load(str(path))
+    except Exception as error:  # OpenVINO raises a type per failure, all of them private
+        raise ModelError(
+            f"{path} is not a model that can run: {one_line(error)}", "give an exported .onnx file"
+        ) from error
+    try:
+        model = reader.convert(read)
+        compiled = openvino.Core().compile_model(model, "CPU", _properties(options.threads))
+    except Exception as error:
+        raise ProviderError(f"OpenVINO can't run {path}: {one_line(error)}", "use the provider auto or cpu") from error
+    threads = compiled.get_property("INFERENCE_NUM_THREADS")
+    placement = Placement(spec.name, reason, threads, _nodes(compiled), _BATCH_SIZES)
+    return OpenVinoModel(compiled, _info(model, path), placement)
 
 
 class OpenVinoModel(LoadedModel):
@@ -32,57 +62,27 @@ class OpenVinoModel(LoadedModel):
         super().__init__(info, placement)
         self._request = compiled.create_infer_request()
 
-    @classmethod
-    def load(
-        cls, path: Path, options: RuntimeOptions = DEFAULT_OPTIONS, reason: str = "it was asked for"
-    ) -> OpenVinoModel:
-        """The network in the file at `path`, on the CPU.
-
-        Raises ModelError for a file that is none or does not describe itself, ProviderError where OpenVINO can't be
-        had.
-        """
-        require_file(path)
-        openvino = imported()
-        # Its reader of ONNX alone: the one that guesses the format complains on stderr of all others.
-        reader = openvino.frontend.FrontEndManager().load_by_framework("onnx")
-        try:
-            read = reader.load(str(path))
-        except Exception as error:  # OpenVINO raises a type per failure, all of them private
-            raise ModelError(
-                f"{path} is not a model that can be run: {one_line(error)}", "give an exported .onnx file"
-            ) from error
-        try:
-            model = reader.convert(read)
-            compiled = openvino.Core().compile_model(model, "CPU", _properties(options.threads))
-        except Exception as error:
-            raise ProviderError(
-                f"OpenVINO can't run {path}: {one_line(error)}", "use the provider auto or cpu"
-            ) from error
-        info = _info(model, path)
-        threads = compiled.get_property("INFERENCE_NUM_THREADS")
-        return cls(compiled, info, Placement("openvino", reason, threads, _nodes(compiled), BUCKETS))
-
     def _outputs(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         self._request.infer([inputs], share_inputs=True)
         return np.array(self._request.get_output_tensor(0).data, dtype=np.float32)
 
 
-def imported() -> Any:
-    """The package `openvino`. Raises ProviderError where it is not installed."""
+def import_openvino() -> Any:
+    """Imports the package `openvino`. Raises ProviderError if it is not installed."""
     try:
         with _without_telemetry():
             return import_module("openvino")
     except ImportError as error:
         raise ProviderError(
-            f"OpenVINO can't be used: {one_line(error)}", "pip install 'lanestream[openvino]', or use the provider cpu"
+            f"OpenVINO does not work: {one_line(error)}", "pip install 'lanestream[openvino]', or use the provider cpu"
         ) from error
 
 
 @contextmanager
 def _without_telemetry() -> Iterator[None]:
-    """Hides the package by which OpenVINO tells Google Analytics of every import; it can do without.
+    """Hides the package by which OpenVINO reports every import to Google Analytics; it works without.
 
-    Whoever imported OpenVINO before has decided otherwise.
+    If OpenVINO was imported before, this changes nothing.
     """
     if _TELEMETRY in sys.modules:
         yield
@@ -98,22 +98,22 @@ def _properties(threads: int | None) -> Mapping[str, Any]:
     return {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": threads or processors(),
-        # By itself it computes in bfloat16 where the CPU can, whatever the file's precision, which costs more accuracy
-        # than an export is allowed; quantised layers stay int8.
+        # By default it computes in bfloat16 if the CPU can, which costs more accuracy than an export may lose; quantized
+        # layers stay int8.
         "INFERENCE_PRECISION_HINT": "f32",
-        # Threads bound to processors stand in the way of other processes bound to the same ones.
+        # Threads pinned to processors block other processes that are pinned to the same ones.
         "ENABLE_CPU_PINNING": False,
     }
 
 
 def _info(model: Any, path: Path) -> ModelInfo:
     where = ["framework", METADATA_KEY]
-    told = {METADATA_KEY: model.get_rt_info(where).astype(str)} if model.has_rt_info(where) else {}
-    return parse_info(told, str(path))
+    metadata = {METADATA_KEY: model.get_rt_info(where).astype(str)} if model.has_rt_info(where) else {}
+    return parse_info(metadata, str(path))
 
 
 def _nodes(compiled: Any) -> Mapping[str, int]:
-    """How many of the nodes that were compiled run in each precision, the most first."""
-    told = [node.get_rt_info() for node in compiled.get_runtime_model().get_ops()]
-    counts = Counter(each["runtimePrecision"].astype(str) for each in told if each["layerType"].astype(str) != "Const")
+    """Returns how many compiled nodes run in each precision, the most first."""
+    nodes = [node.get_rt_info() for node in compiled.get_runtime_model().get_ops()]
+    counts = Counter(each["runtimePrecision"].astype(str) for each in nodes if each["layerType"].astype(str) != "Const")
     return {f"CPU {precision}": count for precision, count in counts.most_common()}

@@ -1,113 +1,189 @@
-"""Choosing an execution provider, and saying honestly which one was got."""
+"""The table of execution providers: what can run a network, what has to be installed, and what `auto` takes.
+
+Light: no runtime is imported before one is loaded. To add a provider of onnxruntime, add a row here and its package to
+an extra in pyproject.toml; another runtime needs a module with a `load` function besides.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from importlib import import_module
 from importlib.util import find_spec
-from typing import Final, Literal
-
-import onnxruntime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import ProviderError
 from lanestream.processors import instructions
-from lanestream.runtime import Provider
 
-# The providers of onnxruntime, and all that a network can be loaded for.
-OnnxProvider = Literal["cpu", "cuda", "tensorrt"]
-Loadable = Literal[OnnxProvider, "openvino"]
+if TYPE_CHECKING:
+    from lanestream.inference.loaded_model import LoadedModel
+    from lanestream.inference.model_info import ModelInfo
 
-# What onnxruntime calls its providers.
-NAMES: Final[Mapping[OnnxProvider, str]] = {
-    "cpu": "CPUExecutionProvider",
-    "cuda": "CUDAExecutionProvider",
-    "tensorrt": "TensorrtExecutionProvider",
-}
-
-_TITLES: Final[Mapping[OnnxProvider, str]] = {"cpu": "CPU", "cuda": "CUDA", "tensorrt": "TensorRT"}
-
-# What `auto` tries, the best first, and why it takes it. TensorRT builds engines for minutes: it must be asked for.
-# OpenVINO multiplies int8 matrices in AMX's tiles, and is up to half as fast again there; on a CPU without them
-# onnxruntime is a little faster (`python tools/providers.py`).
-_AUTO_WITH_AMX: Final[Mapping[Loadable, str]] = {
-    "cuda": "CUDA can be used",
-    "openvino": "OpenVINO is installed, the faster one on a CPU with AMX",
-    "cpu": "onnxruntime on the CPU can always be had",
-}
-_AUTO: Final[Mapping[Loadable, str]] = {
-    "cuda": "CUDA can be used",
-    "cpu": "onnxruntime is the faster one on a CPU without AMX",
-}
+AUTO: Final = "auto"
 
 
 @dataclass(frozen=True)
-class Offer:
-    """What can be had: onnxruntime's providers by its names for them, whether OpenVINO is installed, and whether the
-    CPU has AMX.
+class RuntimeOptions:
+    """How networks run: `threads` of one run on the CPU, if None one for each available processor.
 
-    That a provider is built in does not mean that it can be used: only the loaded network tells what was got.
+    `engine_cache` is the folder in which TensorRT keeps the engines it builds; None builds them at each start.
+    """
+
+    threads: int | None = None
+    engine_cache: Path | None = None
+
+
+DEFAULT_OPTIONS: Final = RuntimeOptions()
+
+
+@dataclass(frozen=True)
+class Installed:
+    """What is installed here: onnxruntime's providers by its names for them, OpenVINO, and whether the CPU has AMX.
+
+    A provider that is built in does not have to work: only the loaded network shows that.
     """
 
     onnxruntime: frozenset[str]
     openvino: bool
     amx: bool
 
+    @classmethod
+    def here(cls) -> Installed:
+        """Returns what is installed on this machine."""
+        return cls(
+            onnxruntime=frozenset(import_module("onnxruntime").get_available_providers()),
+            openvino=find_spec("openvino") is not None,
+            amx="amx_int8" in instructions(),
+        )
 
-def offered() -> Offer:
-    """What can be had here."""
-    return Offer(
-        onnxruntime=frozenset(onnxruntime.get_available_providers()),
-        openvino=find_spec("openvino") is not None,
-        amx="amx_int8" in instructions(),
+    def without_gpus(self) -> Installed:
+        """Returns the same on a machine without a GPU."""
+        return replace(self, onnxruntime=self.onnxruntime & {CPU.onnxruntime_name})
+
+
+@dataclass(frozen=True)
+class ProviderSpec:
+    """One execution provider.
+
+    `onnxruntime_name` is onnxruntime's name for it, empty for another runtime. `is_installed` and `auto_reason` look at
+    what is installed: the latter returns why `auto` takes the provider, or None if it does not. `missing` is the message
+    and the hint if it is not installed. `module` has a function `load(path, spec, options, reason)`. `options` returns
+    onnxruntime's options for the provider.
+    """
+
+    name: str
+    title: str
+    is_installed: Callable[[Installed], bool]
+    missing: tuple[str, str]
+    auto_reason: Callable[[Installed], str | None]
+    module: str = "lanestream.inference.onnx_model"
+    onnxruntime_name: str = ""
+    on_gpu: bool = False
+    options: Callable[[ModelInfo, RuntimeOptions], Mapping[str, str]] = lambda info, options: {}  # noqa: ARG005
+
+    def require(self, installed: Installed) -> None:
+        """Raises ProviderError if it is not installed."""
+        if not self.is_installed(installed):
+            raise ProviderError(*self.missing)
+
+    def load(self, path: Path, options: RuntimeOptions, reason: str) -> LoadedModel:
+        """Loads the model file at `path`. Raises ModelError for an invalid file, ProviderError if it cannot run."""
+        model: LoadedModel = import_module(self.module).load(path, self, options, reason)
+        return model
+
+
+def _of_onnxruntime(name: str) -> Callable[[Installed], bool]:
+    return lambda installed: name in installed.onnxruntime
+
+
+def _no_gpu_build(title: str) -> tuple[str, str]:
+    return (
+        f"the installed onnxruntime has no {title}",
+        "install lanestream[gpu] instead of [cpu], or use the provider auto or cpu",
     )
 
 
-def without_gpus(offer: Offer) -> Offer:
-    """The same on a machine without a GPU."""
-    return replace(offer, onnxruntime=offer.onnxruntime & {NAMES["cpu"]})
+def tensorrt_options(info: ModelInfo, options: RuntimeOptions) -> Mapping[str, str]:
+    """Returns TensorRT's options: half precision only for files in half precision, engines kept in the cache."""
+    found = {"trt_fp16_enable": str(int(info.precision == "fp16"))}
+    if options.engine_cache is not None:
+        cache = str(options.engine_cache)
+        found |= {"trt_engine_cache_enable": "1", "trt_engine_cache_path": cache}
+        found |= {"trt_timing_cache_enable": "1", "trt_timing_cache_path": cache}
+    return found
+
+
+def cuda_options(info: ModelInfo, options: RuntimeOptions) -> Mapping[str, str]:
+    """Returns CUDA's options."""
+    del info, options
+    return {"cudnn_conv_algo_search": "HEURISTIC", "arena_extend_strategy": "kSameAsRequested"}
+
+
+CUDA: Final = ProviderSpec(
+    name="cuda",
+    title="CUDA",
+    is_installed=_of_onnxruntime("CUDAExecutionProvider"),
+    missing=_no_gpu_build("CUDA"),
+    auto_reason=lambda installed: "CUDA is available",  # noqa: ARG005
+    onnxruntime_name="CUDAExecutionProvider",
+    on_gpu=True,
+    options=cuda_options,
+)
+TENSORRT: Final = ProviderSpec(
+    name="tensorrt",
+    title="TensorRT",
+    is_installed=_of_onnxruntime("TensorrtExecutionProvider"),
+    missing=_no_gpu_build("TensorRT"),
+    # It builds engines for minutes, so users have to ask for it.
+    auto_reason=lambda installed: None,  # noqa: ARG005
+    onnxruntime_name="TensorrtExecutionProvider",
+    on_gpu=True,
+    options=tensorrt_options,
+)
+OPENVINO: Final = ProviderSpec(
+    name="openvino",
+    title="OpenVINO",
+    is_installed=lambda installed: installed.openvino,
+    missing=("OpenVINO is not installed", "pip install 'lanestream[openvino]', or use the provider auto or cpu"),
+    # It multiplies int8 matrices in AMX tiles and is up to half as fast again there; on a CPU without them onnxruntime
+    # is a little faster (`python tools/providers.py`).
+    auto_reason=lambda installed: "OpenVINO is installed and faster on a CPU with AMX" if installed.amx else None,
+    module="lanestream.inference.openvino_model",
+)
+CPU: Final = ProviderSpec(
+    name="cpu",
+    title="CPU",
+    is_installed=_of_onnxruntime("CPUExecutionProvider"),
+    missing=("the installed onnxruntime has no CPU provider", "install lanestream[cpu]"),
+    auto_reason=lambda installed: (
+        "onnxruntime on the CPU is always available" if installed.amx else "onnxruntime is faster on a CPU without AMX"
+    ),
+    onnxruntime_name="CPUExecutionProvider",
+)
+
+# `auto` tries them in this order; the last one always works.
+PROVIDERS: Final = (CUDA, TENSORRT, OPENVINO, CPU)
+PROVIDER_NAMES: Final = (AUTO, *(spec.name for spec in PROVIDERS))
+
+
+def find_provider(name: str) -> ProviderSpec:
+    """Returns the provider of that name. Raises ProviderError if there is none."""
+    for spec in PROVIDERS:
+        if spec.name == name:
+            return spec
+    raise ProviderError(f"{name!r} is not a provider", f"use {', '.join(PROVIDER_NAMES)}")
+
+
+def attempts(provider: str, installed: Installed) -> list[tuple[ProviderSpec, str]]:
+    """Returns the providers to try for a requested one or `auto`, in order, each with the reason to take it."""
+    if provider != AUTO:
+        return [(find_provider(provider), f"{provider} was requested")]
+    reasons = [(spec, spec.auto_reason(installed)) for spec in PROVIDERS]
+    return [(spec, reason) for spec, reason in reasons if reason is not None]
 
 
 def cuda_version() -> str | None:
-    """The version of CUDA that the installed onnxruntime is built for, None where it has none."""
-    return onnxruntime.cuda_version or None
-
-
-def preload_gpu_libraries() -> None:
-    """Loads CUDA and cuDNN from Python packages, where the loader would not look; what is missing is told on stderr."""
-    with contextlib.redirect_stdout(sys.stderr):
-        onnxruntime.preload_dlls()
-
-
-def attempts(provider: Provider, offer: Offer) -> Mapping[Loadable, str]:
-    """The providers to try, in order, each with the reason to take it."""
-    if provider != "auto":
-        return {provider: f"{provider} was asked for"}
-    return _AUTO_WITH_AMX if offer.amx else _AUTO
-
-
-def require(provider: Loadable, offer: Offer) -> None:
-    """Raises ProviderError where nothing that is installed has `provider`."""
-    if provider == "openvino":
-        if not offer.openvino:
-            raise ProviderError(
-                "OpenVINO is not installed", "pip install 'lanestream[openvino]', or use the provider auto or cpu"
-            )
-    elif NAMES[provider] not in offer.onnxruntime:
-        raise ProviderError(
-            f"the installed onnxruntime has no {_TITLES[provider]}",
-            "install lanestream[gpu] instead of [cpu], or use the provider auto or cpu",
-        )
-
-
-def verify(provider: OnnxProvider, got: list[str]) -> None:
-    """Raises ProviderError where a session for `provider` came to run on another one of those it `got`.
-
-    onnxruntime falls back in silence, also with its fallback off: only the session itself tells.
-    """
-    if got[0] != NAMES[provider]:
-        raise ProviderError(
-            f"{_TITLES[provider]} can't be used: onnxruntime fell back to {got[0]}",
-            "check the driver and the libraries with `lanestream doctor`, or use the provider auto or cpu",
-        )
+    """Returns the CUDA version that the installed onnxruntime was built for, None without one."""
+    version: str | None = import_module("onnxruntime").cuda_version or None
+    return version

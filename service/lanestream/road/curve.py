@@ -1,11 +1,11 @@
 """A lane boundary as a function x(y) of the image row: it runs away from the camera and crosses each row once.
 
-Coordinates are pixels: x right, y down, floats, pixel centres at integers.
+Coordinates are pixels: x right, y down, floats, pixel centers at integers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,13 +14,17 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+# Three rows determine a curve. As fractions of the distance from the horizon to the bottom row they spread over the
+# part of the road that an image resolves.
+ANCHORS: Final[FloatArray] = np.array([1.0, 0.45, 0.15])
+
 
 @dataclass(frozen=True)
 class Curve:
-    """A boundary as x(y) = v + b u + k / u with u = y - horizon, in pixels; a straight line has k = 0.
+    """A boundary x(y) = v + b u + k / u with the row offset u = y - horizon, in pixels; a straight line has k = 0.
 
     On a flat road this is exactly a parabola of the ground seen in perspective: v is where it meets the horizon, b its
-    lateral place, k its bend. It is valid below the horizon; nearer than one row to it, u counts as one row.
+    lateral position and k its curvature term. It is valid below the horizon; row offsets below 1 count as 1.
     """
 
     horizon: float
@@ -28,71 +32,101 @@ class Curve:
 
     @classmethod
     def through(cls, horizon: float, rows: FloatArray, columns: FloatArray) -> Curve:
-        """The curve through three points at three different rows (3,) below `horizon`."""
-        return curves_through(horizon, rows, columns[None])[0]
+        """Returns the curve through three points at three different `rows` (3,) below `horizon`."""
+        return Curves.through(horizon, rows, columns[None])[0]
 
     def x(self, y: FloatArray | float) -> FloatArray:
-        """Columns at the rows `y`; the shape of the answer is that of `y`."""
+        """Returns the columns at the rows `y`, in the shape of `y`."""
         v, b, k = self.coefficients
-        u = _depth(self.horizon, y)
+        u = _row_offset(self.horizon, y)
         return v + b * u + k / u
 
     def slope(self, y: FloatArray | float) -> FloatArray:
-        """dx/dy at the rows `y`."""
+        """Returns dx/dy at the rows `y`."""
         _, b, k = self.coefficients
-        return b - k / _depth(self.horizon, y) ** 2
+        return b - k / _row_offset(self.horizon, y) ** 2
+
+
+@dataclass(frozen=True)
+class Curves:
+    """N boundaries below one `horizon`; row n of `coefficients` (N, 3) holds v, b and k of boundary n."""
+
+    horizon: float
+    coefficients: FloatArray
+
+    @classmethod
+    def of(cls, curves: Sequence[Curve]) -> Curves:
+        """Returns curves that share a horizon as one batch. Raises ValueError if there are none or horizons differ."""
+        horizons = {curve.horizon for curve in curves}
+        if len(horizons) != 1:
+            raise ValueError(f"the curves have {len(horizons)} horizons; one is needed")
+        return cls(horizons.pop(), np.array([curve.coefficients for curve in curves]))
+
+    @classmethod
+    def none(cls, horizon: float) -> Curves:
+        """Returns an empty batch below `horizon`."""
+        return cls(horizon, np.empty((0, 3)))
+
+    @classmethod
+    def through(cls, horizon: float, rows: FloatArray, columns: FloatArray) -> Curves:
+        """Returns the curves with the `columns` (N, 3) at the same three `rows` (3,) below `horizon`."""
+        return cls(horizon, columns @ np.linalg.inv(curve_basis(horizon, rows)).T)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Curves]) -> Curves:
+        """Returns the curves of all `parts`, which share a horizon, in order."""
+        return cls(parts[0].horizon, np.concatenate([part.coefficients for part in parts]))
+
+    def __len__(self) -> int:
+        return len(self.coefficients)
+
+    def __getitem__(self, index: int) -> Curve:
+        v, b, k = self.coefficients[index].tolist()
+        return Curve(self.horizon, (v, b, k))
+
+    def __iter__(self) -> Iterator[Curve]:
+        return (Curve(self.horizon, (v, b, k)) for v, b, k in self.coefficients.tolist())
+
+    def take(self, indices: NDArray[np.intp] | NDArray[np.bool_] | Sequence[int]) -> Curves:
+        """Returns the curves at `indices`, or those that a mask (N,) selects."""
+        return Curves(self.horizon, self.coefficients[indices])
+
+    def x(self, rows: FloatArray) -> FloatArray:
+        """Returns columns (N, R) at `rows`, which are one set for each curve (N, R) or one for all (R,)."""
+        u = _row_offset(self.horizon, rows)
+        v, b, k = self.coefficients.T[:, :, None]
+        columns: FloatArray = v + b * u + k / u
+        return columns
+
+    def slope(self, rows: FloatArray) -> FloatArray:
+        """Returns dx/dy (N, R) at `rows`, (N, R) or (R,)."""
+        u = _row_offset(self.horizon, rows)
+        _, b, k = self.coefficients.T[:, :, None]
+        slopes: FloatArray = b - k / (u * u)
+        return slopes
+
+    def below(self, horizon: float, bottom: float) -> Curves:
+        """Returns the curves re-expressed below another `horizon`, down to the row `bottom`.
+
+        Each keeps its columns at three rows below both horizons; nearer to the new horizon it continues with the same
+        three coefficients.
+        """
+        if horizon == self.horizon:
+            return self
+        highest = max(horizon, self.horizon)
+        rows = highest + ANCHORS * (bottom - highest)
+        return Curves.through(horizon, rows, self.x(rows))
 
 
 def curve_basis(horizon: float, rows: FloatArray) -> FloatArray:
-    """d x / d (v, b, k) at `rows` (N,): shape (N, 3)."""
-    u = _depth(horizon, rows)
-    return np.stack([np.ones_like(u), u, 1.0 / u], axis=-1)
+    """Returns d x / d (v, b, k) at `rows` (...,) as an array (..., 3)."""
+    u = _row_offset(horizon, rows)
+    basis = np.empty((*u.shape, 3))
+    basis[..., 0] = 1.0
+    basis[..., 1] = u
+    basis[..., 2] = 1.0 / u
+    return basis
 
 
-def curves_through(horizon: float, rows: FloatArray, columns: FloatArray) -> list[Curve]:
-    """The curve through each row of `columns` (N, 3), which they have at the same three `rows` (3,) below `horizon`."""
-    coefficients = np.linalg.solve(curve_basis(horizon, rows), columns.T).T.tolist()
-    return [Curve(horizon, (v, b, k)) for v, b, k in coefficients]
-
-
-# The shares of a depth at which a curve is told anew: three tell it.
-_TELLING: Final = np.array([1.0, 0.45, 0.15])
-
-
-def under_horizon(curves: Sequence[Curve], horizon: float, bottom: float) -> list[Curve]:
-    """The curves told from another `horizon`, from which on they are curves at all, down to the row `bottom`.
-
-    Each has the columns that it had at three rows below its own horizon and below the new one: a curve of a lower
-    horizon goes on as it bends, where it had no columns.
-    """
-    told = []
-    for curve in curves:
-        highest = max(curve.horizon, horizon)
-        rows = highest + _TELLING * (bottom - highest)
-        told += curves_through(horizon, rows, curve_columns([curve], rows))
-    return told
-
-
-def curve_columns(curves: Sequence[Curve], rows: FloatArray) -> FloatArray:
-    """Columns (N, R) of N curves at once, at `rows` of their own (N, R) or the same for all (R,)."""
-    horizon, v, b, k = _told(curves)
-    u = _depth(horizon, rows)
-    columns: FloatArray = v + b * u + k / u
-    return columns
-
-
-def curve_slopes(curves: Sequence[Curve], rows: FloatArray) -> FloatArray:
-    """dx/dy of N curves at once, at `rows` of their own (N, R) or the same for all (R,); shape (N, R)."""
-    horizon, _, b, k = _told(curves)
-    slopes: FloatArray = b - k / _depth(horizon, rows) ** 2
-    return slopes
-
-
-def _told(curves: Sequence[Curve]) -> FloatArray:
-    """Horizons and coefficients of N curves (4, N, 1)."""
-    told = np.array([(curve.horizon, *curve.coefficients) for curve in curves])
-    return told.reshape(-1, 4).T[:, :, None]
-
-
-def _depth(horizon: FloatArray | float, y: FloatArray | float) -> FloatArray:
+def _row_offset(horizon: float, y: FloatArray | float) -> FloatArray:
     return np.maximum(np.asarray(y, dtype=float) - horizon, 1.0)

@@ -1,35 +1,22 @@
-"""What the detectors find and the tracker follows. Coordinates are pixels of the original image."""
+"""What detectors find and trackers follow: detections, tracked boundaries, the ego lane and the result of a frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from lanestream.road.curve import Curve, FloatArray
+from lanestream.road.view import Scaling
 
-State = Literal["detected", "predicted"]
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A possible boundary, straight from the extended Hough transform.
-
-    `top` and `bottom` are the rows between which it is in view and on the road. `strength` orders candidates of one
-    frame (more is better).
-    """
-
-    curve: Curve
-    top: float
-    bottom: float
-    strength: float
+TrackState = Literal["detected", "predicted"]
 
 
 @dataclass(frozen=True)
 class Detection:
     """A boundary found in one frame.
 
-    `covariance` (3, 3) belongs to the curve's coefficients. `probability` is the calibrated chance
-    that this is a lane boundary.
+    `covariance` (3, 3) belongs to the curve's coefficients. The boundary is visible between the rows `top` and
+    `bottom`. `probability` is the calibrated probability that it is a lane boundary.
     """
 
     curve: Curve
@@ -41,15 +28,15 @@ class Detection:
 
 @dataclass(frozen=True)
 class LaneBoundary:
-    """A tracked boundary: a detection with an identity, a history and a place beside the camera.
+    """A tracked boundary: a detection with an identity, a history and a position beside the camera.
 
     `position` is -1 for ego left, +1 for ego right, -2 and +2 for the next ones out. `age_s` counts from its first
-    detection. `state` tells whether a detection of this frame backs it (`detected`) or the filter carries it.
+    detection. `state` is `detected` if a detection of this frame supports it, `predicted` if the filter carries it.
     """
 
     track_id: int
     position: int
-    state: State
+    state: TrackState
     probability: float
     curve: Curve
     covariance: FloatArray
@@ -60,7 +47,7 @@ class LaneBoundary:
 
 @dataclass(frozen=True)
 class LaneChange:
-    """The camera crossed the boundary `track_id`, towards `direction`."""
+    """The camera crossed the boundary `track_id` towards `direction`."""
 
     track_id: int
     direction: Literal["left", "right"]
@@ -68,10 +55,10 @@ class LaneChange:
 
 @dataclass(frozen=True)
 class EgoLane:
-    """The lane the camera is in: the track ids of its boundaries and where the camera is between them.
+    """The lane the camera is in: the track ids of its boundaries and the camera's position between them.
 
-    `offset` is the camera's distance from the lane's centre as a share of the lane width at the bottom row, positive to
-    the right; None unless both boundaries are known.
+    `offset` is the camera's distance from the lane's center as a fraction of the lane width at the bottom row, positive
+    to the right; None unless both boundaries are known.
     """
 
     left: int | None = None
@@ -81,10 +68,24 @@ class EgoLane:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """All that is known after one frame: boundaries from left to right, the ego lane, events, the horizon's row."""
+    """The result of one frame: boundaries from left to right, the ego lane, events, and the horizon's row."""
 
     lanes: tuple[LaneBoundary, ...]
     ego: EgoLane
     horizon: float
     events: tuple[LaneChange, ...] = ()
     timing_ms: dict[str, float] = field(default_factory=dict)
+
+    def to_image(self, scaling: Scaling) -> FrameResult:
+        """Converts a result in working pixels to pixels of the image that `scaling` reduced."""
+        lanes = tuple(
+            replace(
+                lane,
+                curve=scaling.curve_to_image(lane.curve),
+                covariance=scaling.covariance_to_image(lane.covariance),
+                top=scaling.to_image(lane.top),
+                bottom=scaling.to_image(lane.bottom),
+            )
+            for lane in self.lanes
+        )
+        return replace(self, lanes=lanes, horizon=scaling.to_image(self.horizon))

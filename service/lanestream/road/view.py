@@ -1,57 +1,74 @@
-"""Images and the part of them that can be road: working images, rows below the horizon, the rows a curve is in view.
+"""Images and the part of them that can be road: resizing, rows below the horizon, the rows in which a curve is visible.
 
-All resizing of coordinates goes through `Scaling`. Pixel centres are at integers, so a resize by s maps x to
+All resizing of coordinates goes through `Scaling`. Pixel centers are at integers, so a resize by s maps x to
 s (x + 0.5) - 0.5.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.road.curve import Curve, FloatArray, curve_columns
+from lanestream.road.curve import Curve, Curves, FloatArray
 
 Image = NDArray[np.uint8]
 T = TypeVar("T", float, FloatArray)
 
+# Detectors and trackers work on images of this width, so that lengths in pixels mean the same for every camera.
+WORKING_WIDTH: Final = 640
+
+# Nearer to the horizon than this fraction of the road's rows a lane is a few pixels wide, and all lines look alike.
+FARTHEST_VISIBLE: Final = 0.1
+
+# Lanes are 2.5 to 4.5 m wide and cameras 1 to 2.4 m high. In columns per row offset, which are meters over the camera's
+# height, a lane is usually this wide and within these limits.
+USUAL_LANE_WIDTH: Final = 2.4
+LANE_WIDTHS: Final = (1.1, 4.5)
+
+_VISIBILITY_ROWS: Final = 65
+
 
 @dataclass(frozen=True)
 class Scaling:
-    """A uniform resize from image pixels to working pixels; `factor` is working size over image size."""
+    """A uniform resize from image pixels to working pixels; `factor` is the working size over the image size."""
 
     factor: float
 
+    @classmethod
+    def to_working_width(cls, width: int) -> Scaling:
+        """Returns the scaling of an image `width` pixels wide to its working image."""
+        return cls(WORKING_WIDTH / width)
+
     def to_working(self, value: T) -> T:
-        """Image columns or rows, in working pixels."""
+        """Converts image columns or rows to working pixels."""
         return (value + 0.5) * self.factor - 0.5
 
     def to_image(self, value: T) -> T:
-        """Working columns or rows, in image pixels."""
+        """Converts working columns or rows to image pixels."""
         return (value + 0.5) / self.factor - 0.5
 
     def curve_to_image(self, curve: Curve) -> Curve:
-        """A working curve, in image pixels."""
+        """Converts a curve from working to image pixels."""
         v, b, k = curve.coefficients
         return Curve(self.to_image(curve.horizon), (self.to_image(v), b, k / self.factor**2))
 
-    def covariance_to_image(self, covariance: FloatArray) -> FloatArray:
-        """The covariance (3, 3) of a working curve's coefficients, of those in image pixels."""
-        by = np.array([1.0 / self.factor, 1.0, 1.0 / self.factor**2])
-        return covariance * np.outer(by, by)
-
     def curve_to_working(self, curve: Curve) -> Curve:
-        """An image curve, in working pixels."""
+        """Converts a curve from image to working pixels."""
         v, b, k = curve.coefficients
         return Curve(self.to_working(curve.horizon), (self.to_working(v), b, k * self.factor**2))
+
+    def covariance_to_image(self, covariance: FloatArray) -> FloatArray:
+        """Converts the covariance (3, 3) of a curve's coefficients from working to image pixels."""
+        by = np.array([1.0 / self.factor, 1.0, 1.0 / self.factor**2])
+        return covariance * np.outer(by, by)
 
 
 @dataclass(frozen=True)
 class RoadView:
-    """What of an image can be road: all below the horizon. Sizes and rows in pixels of that image."""
+    """The part of an image that can be road: all below the horizon. Sizes and rows in pixels of that image."""
 
     width: int
     height: int
@@ -64,35 +81,53 @@ class RoadView:
 
     @property
     def depth(self) -> float:
-        """Rows between the horizon and the bottom: the scale of everything on the road."""
+        """The number of rows from the horizon to the bottom: the scale of everything on the road."""
         return self.bottom - self.horizon
 
-    def scaled(self, scaling: Scaling, width: int, height: int) -> RoadView:
-        """The same view of the working image, which is `width` x `height`."""
-        return RoadView(width, height, scaling.to_working(self.horizon))
+    @property
+    def middle(self) -> float:
+        """The middle column, above which a camera in the middle of its lane stands."""
+        return (self.width - 1) / 2.0
 
     def row_at(self, share: float) -> float:
-        """The row at `share` of the way from the horizon (0) to the bottom (1)."""
+        """Returns the row at `share` of the way from the horizon (0) to the bottom (1)."""
         return self.horizon + share * self.depth
 
+    def with_horizon(self, horizon: float) -> RoadView:
+        """Returns the same image with another horizon."""
+        return replace(self, horizon=horizon)
 
-def visible_rows(curve: Curve, view: RoadView, top_share: float) -> tuple[float, float] | None:
-    """The (top, bottom) rows between which `curve` is inside the image and `top_share` of the depth below the horizon.
 
-    None where fewer than two rows of it are in view. Where a bent curve leaves and comes back, the part that begins
-    nearest to the camera counts.
+@dataclass(frozen=True)
+class Spans:
+    """The rows `top` (N,) to `bottom` (N,) in which N curves are visible, and `visible` (N,): at least two rows are."""
+
+    top: FloatArray
+    bottom: FloatArray
+    visible: NDArray[np.bool_]
+
+    def take(self, indices: NDArray[np.intp] | NDArray[np.bool_]) -> Spans:
+        """Returns the spans at `indices`, or those that a mask (N,) selects."""
+        return Spans(self.top[indices], self.bottom[indices], self.visible[indices])
+
+
+def visible_spans(curves: Curves, view: RoadView, top_share: float = FARTHEST_VISIBLE) -> Spans:
+    """Returns the rows in which each curve is inside the image and at least `top_share` of the depth below the horizon.
+
+    If a curve leaves the image and comes back, the part nearest to the camera counts.
     """
-    return visible_spans([curve], view, top_share)[0]
-
-
-def visible_spans(curves: Sequence[Curve], view: RoadView, top_share: float) -> list[tuple[float, float] | None]:
-    """`visible_rows` of each of the `curves`, at once."""
-    rows = np.linspace(view.bottom, view.row_at(top_share), 65)
-    columns = curve_columns(curves, rows)
+    rows = np.linspace(view.bottom, view.row_at(top_share), _VISIBILITY_ROWS)
+    columns = curves.x(rows)
     inside = (columns >= 0.0) & (columns <= view.width - 1.0)
     first = inside.argmax(axis=1)
-    left = ~inside & (np.arange(len(rows)) > first[:, None])
-    last = np.where(left.any(axis=1), left.argmax(axis=1), len(rows)) - 1
-    spans = zip(rows[last].tolist(), rows[first].tolist(), strict=True)
-    # Of a curve that is nowhere inside, the span is its first row alone.
-    return [(top, bottom) if bottom - top >= 2.0 else None for top, bottom in spans]
+    left = ~inside & (np.arange(_VISIBILITY_ROWS) > first[:, None])
+    last = np.where(left.any(axis=1), left.argmax(axis=1), _VISIBILITY_ROWS) - 1
+    top, bottom = rows[last], rows[first]
+    # The span of a curve that is nowhere inside is its first row alone.
+    return Spans(top, bottom, bottom - top >= 2.0)
+
+
+def visible_rows(curve: Curve, view: RoadView, top_share: float = FARTHEST_VISIBLE) -> tuple[float, float] | None:
+    """Returns the visible (top, bottom) rows of one curve as `visible_spans` does, or None if it is not visible."""
+    spans = visible_spans(Curves.of([curve]), view, top_share)
+    return (float(spans.top[0]), float(spans.bottom[0])) if spans.visible[0] else None

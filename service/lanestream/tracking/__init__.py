@@ -1,5 +1,1 @@
-"""Following boundaries from frame to frame."""
-
-from lanestream.tracking.tracker import LaneTracker, TrackerSettings
-
-__all__ = ["LaneTracker", "TrackerSettings"]
+"""Tracking: detections in, boundaries with identities out."""

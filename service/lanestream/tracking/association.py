@@ -1,86 +1,94 @@
-"""Which detection belongs to which track: gated, globally cheapest, in order from left to right."""
+"""Association: which detection belongs to which track, gated, and in order from left to right."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from lanestream.road.curve import FloatArray
-from lanestream.tracking.kalman import mahalanobis
+from lanestream.tracking.kalman import MEASURED, innovation_distances
 from lanestream.tracking.tracks import Track
 
-# Chi-square with three degrees of freedom, 99.7 %.
-GATE = 14.2
+# The 99.7 % quantile of chi-square with three degrees of freedom.
+GATE: Final = 14.2
 
 
-def associate(tracks: Sequence[Track], measured: Sequence[tuple[FloatArray, FloatArray]]) -> list[tuple[int, int]]:
-    """(track, detection) index pairs for detections told as columns (3,) and their covariance (3, 3).
+def associate(tracks: Sequence[Track], columns: FloatArray, noise: FloatArray) -> list[tuple[int, int]]:
+    """Returns (track, detection) index pairs for detections with the `columns` (M, 3) and covariances `noise` (M, 3, 3).
 
-    The cost is the innovation's negative log likelihood, d^2 + ln det S; pairs outside the gate are impossible.
-    Boundaries don't cross at the bottom row, so of two pairs that would swap sides the dearer one is given up.
+    The cost of a pair is the innovation's negative log likelihood d^2 + ln det S; pairs outside the gate are impossible.
+    Boundaries do not cross at the bottom row, so tracks and detections are matched in order from left to right: the most
+    pairs that keep the order, and of those the cheapest. That is an alignment of two sequences, found by dynamic
+    programming (S. Needleman and C. Wunsch, 1970).
     """
-    if not tracks or not measured:
+    if not tracks or not len(columns):
         return []
-    distance, log_determinant = mahalanobis(
+    distance, log_determinant = innovation_distances(
         np.stack([track.columns for track in tracks]),
-        np.stack([track.kalman.P[:3, :3] for track in tracks]),
-        np.stack([columns for columns, _ in measured]),
-        np.stack([noise for _, noise in measured]),
+        np.stack([track.covariance[:MEASURED, :MEASURED] for track in tracks]),
+        columns,
+        noise,
     )
     costs = np.where(distance <= GATE, distance + log_determinant, np.inf)
-    finite = np.isfinite(costs)
-    if not finite.any():
-        return []
-    # A constant above every possible cost keeps the assignment feasible; such pairs are taken out again.
-    dear = costs[finite].max() + 1e6
-    rows, columns_ = linear_sum_assignment(np.where(finite, costs, dear))
-    pairs = [(int(i), int(j)) for i, j in zip(rows, columns_, strict=True) if finite[i, j]]
-    pairs.sort(key=lambda pair: costs[pair])
-    kept: list[tuple[int, int]] = []
-    for pair in pairs:
-        if not any(_swaps(pair, other, tracks, measured) for other in kept):
-            kept.append(pair)
-    return kept
+    left_to_right = np.argsort([track.columns[0] for track in tracks], kind="stable").tolist()
+    seen_left_to_right = np.argsort(columns[:, 0], kind="stable").tolist()
+    aligned = _cheapest_alignment(costs[np.ix_(left_to_right, seen_left_to_right)].tolist())
+    return [(left_to_right[i], seen_left_to_right[j]) for i, j in aligned]
+
+
+def _cheapest_alignment(costs: list[list[float]]) -> list[tuple[int, int]]:
+    """Returns the pairs (row, column), both ascending, of the most finite costs, and of those with the lowest sum."""
+    rows, columns = len(costs), len(costs[0])
+    # best[i][j] is (-number of pairs, sum of costs) of the first i rows and j columns.
+    best = [[(0, 0.0)] * (columns + 1) for _ in range(rows + 1)]
+    for i in range(1, rows + 1):
+        for j in range(1, columns + 1):
+            number, total = best[i - 1][j - 1]
+            cost = costs[i - 1][j - 1]
+            paired = (number - 1, total + cost) if np.isfinite(cost) else (1, 0.0)
+            best[i][j] = min(best[i - 1][j], best[i][j - 1], paired)
+    pairs = []
+    i, j = rows, columns
+    while i and j:
+        if best[i][j] == best[i - 1][j]:
+            i -= 1
+        elif best[i][j] == best[i][j - 1]:
+            j -= 1
+        else:
+            i, j = i - 1, j - 1
+            pairs.append((i, j))
+    return pairs[::-1]
 
 
 def recover(
-    tracks: Sequence[Track],
-    measured: Sequence[tuple[FloatArray, FloatArray]],
-    pairs: Sequence[tuple[int, int]],
-    reach: FloatArray,
+    tracks: Sequence[Track], columns: FloatArray, pairs: Sequence[tuple[int, int]], reach: FloatArray
 ) -> list[tuple[int, int]]:
-    """(track, detection) pairs of confirmed tracks left out of `pairs`, nearer at the two near rows than `reach` (3,).
+    """Returns further (track, detection) pairs: confirmed tracks without one, and detections within `reach` (3,) of them.
 
-    A road that turns faster than the filter believes takes its detections out of the track's gate. Where they are still
-    nearest to that track in the second frame, they are the same boundary, and the filter was wrong; a single one out of
-    the gate is an error. Nearest pairs first. Detections of tentative tracks count as free: it is they that were begun
-    when the detection left the gate.
+    A road that turns faster than the filter expects takes its detections out of the track's gate. If they are still
+    nearest to that track in the second frame, they are the same boundary and the filter was wrong; a single one outside
+    the gate is an error. Distances count at the two near rows; the nearest pairs come first. Detections of tentative
+    tracks are available: those tracks began when the detection left the gate.
     """
-    firm = [(i, j) for i, j in pairs if tracks[i].confirmed]
+    confirmed = [(i, j) for i, j in pairs if tracks[i].confirmed]
     near = []
     for i, track in enumerate(tracks):
-        if not track.confirmed or track.detected or any(i == other for other, _ in firm):
+        if not track.confirmed or track.detected or any(i == other for other, _ in confirmed):
             continue
-        for j, (columns, _) in enumerate(measured):
-            share = float((np.abs(columns - track.columns) / reach)[:2].max())
-            if share < 1.0:
-                near.append((share, i, j))
-    kept = list(firm)
+        shares = (np.abs(columns - track.columns) / reach)[:, :2].max(axis=1).tolist()
+        near += [(share, i, j) for j, share in enumerate(shares) if share < 1.0]
+    kept = list(confirmed)
     for _, i, j in sorted(near):
         free = all(i != other[0] and j != other[1] for other in kept)
-        if free and not any(_swaps((i, j), other, tracks, measured) for other in kept):
+        if free and not any(_swaps((i, j), other, tracks, columns) for other in kept):
             kept.append((i, j))
-    return kept[len(firm) :]
+    return kept[len(confirmed) :]
 
 
-def _swaps(
-    one: tuple[int, int],
-    other: tuple[int, int],
-    tracks: Sequence[Track],
-    measured: Sequence[tuple[FloatArray, FloatArray]],
-) -> bool:
+def _swaps(one: tuple[int, int], other: tuple[int, int], tracks: Sequence[Track], columns: FloatArray) -> bool:
+    """Returns whether two pairs would swap sides."""
     before = tracks[one[0]].columns[0] - tracks[other[0]].columns[0]
-    after = measured[one[1]][0][0] - measured[other[1]][0][0]
+    after = columns[one[1], 0] - columns[other[1], 0]
     return bool(before * after < 0.0)

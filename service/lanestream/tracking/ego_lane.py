@@ -1,67 +1,62 @@
-"""Places beside the camera: which boundaries bound the ego lane, and when the camera has crossed one."""
+"""The ego lane: its width, the positions of boundaries beside the camera, and when the camera crosses one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Final
 
 from lanestream.road.results import LaneChange
+from lanestream.road.view import LANE_WIDTHS
 from lanestream.tracking.tracks import Track
 
-# A lane is 2.5 to 4 m wide and a camera 1.0 to 2.4 m high: its width over the rows below the horizon.
-_WIDTHS = (1.1, 4.0)
+# How quickly the lane width follows that of a frame.
+_WIDTH_GAIN: Final = 0.05
+# A boundary has changed sides if it was this many lane widths on the other side of the camera for so many frames.
+_CROSSING_MARGIN: Final = 0.1
+_CROSSING_FRAMES: Final = 3
+# A gap of more lane widths than this counts as two lanes. The camera may be anywhere in its lane, so the first boundary
+# is up to a whole lane width away.
+_FIRST_GAP: Final = 1.3
+_NEXT_GAP: Final = 1.6
 
 
-@dataclass
-class LaneWidth:
-    """The ego lane's width in rows below the horizon, learned slowly; starts as 3.5 m seen from 1.5 m."""
-
-    value: float = 2.3
-    gain: float = 0.05
-
-    def learn(self, width: float) -> None:
-        """Takes in one frame's width; one that no lane has is ignored."""
-        if _WIDTHS[0] <= width <= _WIDTHS[1]:
-            self.value += self.gain * (width - self.value)
+def learned_width(width: float, measured: float) -> float:
+    """Returns the lane width after a frame's `measured` one, both in row offsets; one that no lane has is ignored."""
+    narrowest, widest = LANE_WIDTHS
+    return width + _WIDTH_GAIN * (measured - width) if narrowest <= measured <= widest else width
 
 
-@dataclass(frozen=True)
-class Sides:
-    """When a boundary has changed sides: beyond `margin` lane widths from the camera, for `frames` frames."""
+def lane_change(track: Track, column: float, camera: float, lane_width: float) -> LaneChange | None:
+    """Records a track's `column` at the bottom row; returns a lane change if the track has just changed sides.
 
-    margin: float = 0.1
-    frames: int = 3
-
-    def update(self, track: Track, column: float, camera: float, lane_width: float) -> LaneChange | None:
-        """Notes a track's column at the bottom row; a lane change where it has just changed sides for good."""
-        away = (column - camera) * track.side
-        if away > -self.margin * lane_width:
-            track.crossing = 0
-            return None
-        track.crossing += 1
-        if track.crossing < self.frames:
-            return None
-        track.side, track.crossing = -track.side, 0
-        if track.track_id is None:
-            return None
-        # A boundary that wanders to the left shows that the camera went to the right.
-        return LaneChange(track.track_id, "right" if track.side < 0 else "left")
+    `camera` is the camera's column, `lane_width` is in pixels at that row.
+    """
+    if (column - camera) * track.side > -_CROSSING_MARGIN * lane_width:
+        track.crossing = 0
+        return None
+    track.crossing += 1
+    if track.crossing < _CROSSING_FRAMES:
+        return None
+    track.side, track.crossing = -track.side, 0
+    if track.track_id is None:
+        return None
+    # A boundary that moves to the left shows that the camera moves to the right.
+    return LaneChange(track.track_id, "right" if track.side < 0 else "left")
 
 
-def positions(tracks: Sequence[Track], columns: Sequence[float], camera: float, lane_width: float) -> list[int]:
-    """The position of each track from its column at the bottom row.
+def lane_positions(tracks: Sequence[Track], columns: Sequence[float], camera: float, lane_width: float) -> list[int]:
+    """Returns the position of each track from its column at the bottom row.
 
     Boundaries are counted outwards from the camera. A gap of about two lane widths counts as two, so that a boundary
-    nobody sees leaves its place empty.
+    that is not seen leaves its position empty.
     """
     result = [0] * len(tracks)
     for side in (-1, 1):
         outwards = sorted((side * (columns[i] - camera), i) for i, track in enumerate(tracks) if track.side == side)
-        place, last = 0, 0.0
+        position, last = 0, 0.0
         for number, (distance, index) in enumerate(outwards):
             gap = (distance - last) / lane_width
-            # The camera may be anywhere in its lane, so the first boundary is up to a whole lane width away.
-            steps = 1 if gap < (1.3 if number == 0 else 1.6) else 2
-            place, last = place + steps, distance
-            result[index] = side * place
+            position += 1 if gap < (_FIRST_GAP if number == 0 else _NEXT_GAP) else 2
+            last = distance
+            result[index] = side * position
     return result

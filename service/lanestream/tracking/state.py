@@ -1,4 +1,4 @@
-"""What a tracker remembers, as a small value of plain types: saved in one process, it goes on exactly in another."""
+"""The state of a tracker as a small value of plain types: saved in one process, it continues exactly in another."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from typing import Final
 
 import numpy as np
 
-from lanestream.road.curve import FloatArray
-from lanestream.tracking.kalman import Rows, boundary_filter
+from lanestream.road.view import USUAL_LANE_WIDTH
+from lanestream.tracking.kalman import STATE, TrackedRows
 from lanestream.tracking.tracks import Track
 
-_STATE: Final = 6
 _NUMBERS: Final = "<f8"
 
 
 @dataclass(frozen=True)
-class TrackState:
-    """One track: `filter` holds its filter's state (6) and covariance (6 x 6), little-endian doubles in base 64."""
+class TrackSnapshot:
+    """One track: `filter` holds its state (6) and covariance (6 x 6), little-endian doubles in base 64."""
 
     track_id: int | None
     filter: str
@@ -32,12 +31,12 @@ class TrackState:
     side: int
     crossing: int
     detected: bool
-    turned: float = 0.0
+    drift: float = 0.0
 
     @classmethod
-    def of(cls, track: Track) -> TrackState:
-        """The state of `track`."""
-        numbers = np.concatenate([track.kalman.x, track.kalman.P.ravel()])
+    def of(cls, track: Track) -> TrackSnapshot:
+        """Returns the snapshot of `track`."""
+        numbers = np.concatenate([track.state, track.covariance.ravel()])
         return cls(
             track_id=track.track_id,
             filter=b64encode(numbers.astype(_NUMBERS).tobytes()).decode(),
@@ -50,17 +49,15 @@ class TrackState:
             side=track.side,
             crossing=track.crossing,
             detected=track.detected,
-            turned=track.turned,
+            drift=track.drift,
         )
 
     def track(self, memory: int) -> Track:
-        """The track in this state, which remembers the hits of `memory` frames. Raises ValueError for half a filter."""
+        """Returns the track, which remembers the hits of `memory` frames. Raises ValueError for an incomplete filter."""
         numbers = np.frombuffer(b64decode(self.filter, validate=True), _NUMBERS).astype(float)
-        x, covariance = numbers[:_STATE], numbers[_STATE:].reshape(_STATE, _STATE)
-        kalman = boundary_filter(x[:3], covariance[:3, :3], np.zeros(3))
-        kalman.x, kalman.P = x.copy(), covariance.copy()
         return Track(
-            kalman,
+            numbers[:STATE].copy(),
+            numbers[STATE:].reshape(STATE, STATE).copy(),
             born=self.born,
             last_hit=self.last_hit,
             probability=self.probability,
@@ -71,36 +68,26 @@ class TrackState:
             track_id=self.track_id,
             crossing=self.crossing,
             detected=self.detected,
-            turned=self.turned,
+            drift=self.drift,
         )
 
 
 @dataclass(frozen=True)
 class TrackerState:
-    """A tracker: its tracks, the rows that it follows them at, its clock, and the ids that it has given."""
+    """A tracker: its tracks, the rows at which it follows them, its clock, and the ids it has assigned."""
 
-    tracks: tuple[TrackState, ...]
-    horizon: float | None
-    rows: tuple[float, float, float] | None
-    lane_width: float
-    next_id: int
-    clock: float
-    last_timestamp: float | None
-    frames: int
+    tracks: tuple[TrackSnapshot, ...] = ()
+    horizon: float | None = None
+    rows: tuple[float, float, float] | None = None
+    lane_width: float = USUAL_LANE_WIDTH
+    next_id: int = 1
+    clock: float = 0.0
+    last_timestamp: float | None = None
+    frames: int = 0
 
     @property
-    def followed_rows(self) -> Rows | None:
+    def tracked_rows(self) -> TrackedRows | None:
         """The rows as the tracker has them; None before its first frame."""
         if self.horizon is None or self.rows is None:
             return None
-        return Rows(self.horizon, np.array(self.rows))
-
-
-def told_rows(rows: Rows | None) -> tuple[float | None, tuple[float, float, float] | None]:
-    """Horizon and rows as plain numbers."""
-    return (None, None) if rows is None else (rows.horizon, _three(rows.y))
-
-
-def _three(values: FloatArray) -> tuple[float, float, float]:
-    a, b, c = (float(value) for value in values)
-    return a, b, c
+        return TrackedRows(self.horizon, np.array(self.rows))

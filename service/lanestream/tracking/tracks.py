@@ -1,27 +1,27 @@
-"""The life of one tracked boundary: tentative, confirmed, coasting, gone."""
+"""The life of one tracked boundary: tentative, confirmed, coasting, deleted."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
 
-from filterpy.kalman import KalmanFilter
-
 from lanestream.road.curve import FloatArray
 from lanestream.road.results import Detection
-from lanestream.tracking.kalman import Rows
+from lanestream.tracking.kalman import MEASURED, TrackedRows
 
 
 @dataclass
 class Track:
-    """A boundary with a past. Times are seconds on the tracker's own clock.
+    """A tracked boundary. Times are seconds on the tracker's own clock.
 
-    `hits` remembers for the last frames whether a detection backed it. `side` is -1 left and +1 right of the camera;
-    `crossing` counts the frames in which it has been clearly on the other one. `turned` tells how much the road has
-    turned beneath it since it was last seen. `previous_columns` are those of the frame before.
+    `state` (6,) and `covariance` (6, 6) are the filter's. `hits` remembers for the last frames whether a detection
+    supported it. `side` is -1 left and +1 right of the camera; `crossing` counts the frames in which it has been clearly
+    on the other one. `drift` is how much the road has turned under it since it was last detected. `previous_columns` are
+    those of the last frame.
     """
 
-    kalman: KalmanFilter
+    state: FloatArray
+    covariance: FloatArray
     born: float
     last_hit: float
     probability: float
@@ -32,58 +32,54 @@ class Track:
     track_id: int | None = None
     crossing: int = 0
     detected: bool = True
-    turned: float = 0.0
+    drift: float = 0.0
     previous_columns: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.previous_columns = self.kalman.x[:3].copy()
+        self.previous_columns = self.columns
 
     @property
     def confirmed(self) -> bool:
-        """Whether it has been given an identity."""
+        """Whether it has an identity."""
         return self.track_id is not None
 
     @property
-    def seen_twice(self) -> bool:
-        """Whether a detection backed it in this frame and in the last one, so that it moved as its boundary did."""
+    def detected_twice(self) -> bool:
+        """Whether detections supported it in this frame and in the last one, so that it moved as its boundary did."""
         return len(self.hits) > 1 and self.hits[-1] and self.hits[-2]
 
     @property
     def columns(self) -> FloatArray:
-        """Columns (3,) at the tracker's rows."""
-        columns: FloatArray = self.kalman.x[:3]
-        return columns
+        """The columns (3,) at the tracker's rows."""
+        return self.state[:MEASURED]
 
-    def hit(self, detection: Detection, columns: FloatArray, noise: FloatArray, now: float) -> None:
-        """Takes in a detection whose columns (3,) have the covariance `noise` (3, 3)."""
-        self.kalman.update(columns, R=noise)
+    def hit(self, detection: Detection, now: float) -> None:
+        """Records a detection, with which the filter was updated."""
         self.hits.append(True)
         self.detected = True
-        self.turned = 0.0
+        self.drift = 0.0
         self.last_hit = now
         self.probability += 0.4 * (detection.probability - self.probability)
         self.top += 0.3 * (detection.top - self.top)
         self.bottom += 0.3 * (detection.bottom - self.bottom)
 
-    def restart(self, kalman: KalmanFilter) -> None:
-        """Forgets the filter's past for a fresh `kalman`; the boundary stays who it is."""
-        self.kalman = kalman
-
     def miss(self) -> None:
-        """Notes a frame without a detection."""
+        """Records a frame without a detection."""
         self.hits.append(False)
         self.detected = False
 
-    def carried(self, below: FloatArray) -> None:
-        """Notes that it was moved unseen since the frame before; its rows are `below` (3,) the horizon."""
+    def coast(self, below: FloatArray) -> None:
+        """Records a move without a detection; the tracked rows are `below` (3,) the horizon."""
         near, middle, _ = (self.columns - self.previous_columns) / below
-        self.turned += abs(float(middle - near))
+        self.drift += abs(float(middle - near))
 
-    def move_rows(self, old: Rows, new: Rows) -> None:
-        """Tells the state at other rows."""
-        matrix = old.mapped_to(new)
-        state, covariance = self.kalman.x, self.kalman.P
-        for i in (0, 3):
-            state[i : i + 3] = matrix @ state[i : i + 3]
-            for j in (0, 3):
-                covariance[i : i + 3, j : j + 3] = matrix @ covariance[i : i + 3, j : j + 3] @ matrix.T
+    def change_rows(self, old: TrackedRows, new: TrackedRows) -> None:
+        """Expresses the state at other rows."""
+        matrix = old.mapping_to(new)
+        state, covariance = self.state.copy(), self.covariance.copy()
+        for i in (0, MEASURED):
+            state[i : i + MEASURED] = matrix @ state[i : i + MEASURED]
+            for j in (0, MEASURED):
+                block = covariance[i : i + MEASURED, j : j + MEASURED]
+                covariance[i : i + MEASURED, j : j + MEASURED] = matrix @ block @ matrix.T
+        self.state, self.covariance = state, covariance

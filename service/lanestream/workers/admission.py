@@ -1,4 +1,4 @@
-"""Admission: which frame is worked on next, when there are more than there are threads."""
+"""Admission: which frame is processed next if there are more than the workers can take."""
 
 from __future__ import annotations
 
@@ -10,55 +10,55 @@ from dataclasses import dataclass, field
 
 
 @dataclass(eq=False)
-class _Waiting:
-    fresh: bool
-    called: asyncio.Future[None] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
+class _Waiter:
+    latest: bool
+    admitted: asyncio.Future[None] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
 
 
-class Admission:
-    """`places` among the frames in work, first come, first served; at most `fresh` of them for frames wanted fresh.
+class FairSemaphore:
+    """Admits frames to `slots`, first come, first served; at most `latest_slots` of them for frames of mode `latest`.
 
-    A frame wanted fresh that has to leave the places to others keeps its place in the line: where cameras of both kinds
-    wait, none of them waits for longer than the others' frames take. Belongs to one event loop.
+    A frame of mode `latest` that has to leave the slots to others keeps its place in the queue: if cameras of both modes
+    wait, none waits for longer than the others' frames take. Belongs to one event loop.
     """
 
-    def __init__(self, places: int, fresh: int) -> None:
-        self._places, self._fresh = places, fresh
-        self._line: deque[_Waiting] = deque()
+    def __init__(self, slots: int, latest_slots: int) -> None:
+        self._slots, self._latest_slots = slots, latest_slots
+        self._queue: deque[_Waiter] = deque()
 
     @asynccontextmanager
-    async def turn(self, *, fresh: bool = False) -> AsyncIterator[None]:
-        """Waits for a place, and has it for the block."""
-        waiting = _Waiting(fresh)
-        self._line.append(waiting)
-        self._call()
+    async def slot(self, *, latest: bool = False) -> AsyncIterator[None]:
+        """Waits for a slot and holds it for the block."""
+        waiter = _Waiter(latest)
+        self._queue.append(waiter)
+        self._admit()
         try:
-            await waiting.called
+            await waiter.admitted
         except asyncio.CancelledError:
-            if waiting in self._line:
-                self._line.remove(waiting)
-            else:  # called in the very moment in which it gave up
-                self._leave(waiting)
+            if waiter in self._queue:
+                self._queue.remove(waiter)
+            else:  # admitted at the moment it was canceled
+                self._release(waiter)
             raise
         try:
             yield
         finally:
-            self._leave(waiting)
+            self._release(waiter)
 
-    def _call(self) -> None:
-        """Gives the free places to those who have waited longest and may have them."""
-        for waiting in tuple(self._line):
-            if not self._places:
+    def _admit(self) -> None:
+        """Gives the free slots to those who have waited longest and may have them."""
+        for waiter in tuple(self._queue):
+            if not self._slots:
                 return
-            if waiting.fresh and not self._fresh:
+            if waiter.latest and not self._latest_slots:
                 continue
-            self._line.remove(waiting)
-            self._places -= 1
-            self._fresh -= waiting.fresh
-            if not waiting.called.done():
-                waiting.called.set_result(None)
+            self._queue.remove(waiter)
+            self._slots -= 1
+            self._latest_slots -= waiter.latest
+            if not waiter.admitted.done():
+                waiter.admitted.set_result(None)
 
-    def _leave(self, waiting: _Waiting) -> None:
-        self._places += 1
-        self._fresh += waiting.fresh
-        self._call()
+    def _release(self, waiter: _Waiter) -> None:
+        self._slots += 1
+        self._latest_slots += waiter.latest
+        self._admit()

@@ -1,4 +1,4 @@
-"""What a service offers: its detectors by name, with what is to be told of the network of each."""
+"""What a service can do: its detectors by name, with a summary of the model of each."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lanestream.detection import chosen
+from lanestream.errors import NoDetectorError
 
 if TYPE_CHECKING:
-    from lanestream.detection import Network, Pipeline
-    from lanestream.protocol import DetectorName
+    from lanestream.engine import Engine
+    from lanestream.inference.loaded_model import LoadedModel
 
 
 @dataclass(frozen=True)
 class ModelSummary:
-    """A loaded network as others see it: the fields are those of `lanestream.detection.Network`."""
+    """A loaded model as clients see it; `provider`, `reason` and `fell_back` are those of its `Placement`."""
 
     name: str
     provider: str
@@ -25,31 +25,40 @@ class ModelSummary:
     metadata: Mapping[str, Any]
 
     @classmethod
-    def of(cls, network: Network) -> ModelSummary:
-        """What is to be told of `network`."""
-        told = network.name, network.provider, network.reason, network.fell_back, network.sha256
-        return cls(*told, dict(network.metadata))
+    def of(cls, model: LoadedModel) -> ModelSummary:
+        """Returns the summary of `model`."""
+        placement = model.placement
+        return cls(
+            model.name, placement.provider, placement.reason, placement.fell_back, model.sha256, model.metadata
+        )
 
 
 @dataclass(frozen=True)
-class Offer:
-    """A detector by the name that users ask for it, and the network that answers it."""
+class DetectorInfo:
+    """A detector by the name that users ask for, and the model that it cannot do without."""
 
-    detector: DetectorName
-    network: ModelSummary
+    detector: str
+    model: ModelSummary
 
 
+@dataclass(frozen=True)
 class Capabilities:
     """All detectors of a service; the first one is the default."""
 
-    def __init__(self, offers: Iterable[Offer]) -> None:
-        self.all = tuple(offers)
+    detectors: tuple[DetectorInfo, ...]
 
     @classmethod
-    def of(cls, pipelines: Iterable[Pipeline]) -> Capabilities:
-        """What these offer."""
-        return cls(Offer(pipeline.name, ModelSummary.of(pipeline.network)) for pipeline in pipelines)
+    def of(cls, engine: Engine) -> Capabilities:
+        """Returns the capabilities of an engine."""
+        return cls(tuple(DetectorInfo(name, ModelSummary.of(engine.main_model(name))) for name in engine.detectors))
 
-    def chosen(self, name: DetectorName | None = None) -> Offer:
-        """The offer of that name, the default one where None. Raises NoDetectorError where there is none."""
-        return chosen({offer.detector: offer for offer in self.all}, name)
+    def select(self, name: str | None = None) -> DetectorInfo:
+        """Returns the detector of that name, by default the first one. Raises NoDetectorError if it is missing."""
+        for info in self.detectors:
+            if name in (None, info.detector):
+                return info
+        raise NoDetectorError(f"there is no detector {name} here", f"ask for {', '.join(_names(self.detectors))}")
+
+
+def _names(detectors: Iterable[DetectorInfo]) -> list[str]:
+    return [info.detector for info in detectors]

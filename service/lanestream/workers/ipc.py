@@ -1,7 +1,7 @@
-"""What a service and its worker processes send each other: Python's own values, each with its length before it.
+"""Messages between a service and its worker processes: Python's own values, each after its length.
 
-Both ends are the same program on the same machine, joined by a socket that nobody else can reach; nothing that comes
-from outside is ever read as such a value.
+Both ends are the same program on the same machine, joined by a socket that nobody else can reach; data from outside is
+never read as such a message.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ if TYPE_CHECKING:
     from lanestream.images.decoding import ImageLimits
     from lanestream.inference.batcher import BatchReport
     from lanestream.messages import ProcessedFrame
-    from lanestream.protocol import DetectorName
     from lanestream.session import SessionState
     from lanestream.workers.frame_worker import EncodedFrame
 
-    Outcome = tuple[ProcessedFrame, SessionState] | Exception
+    FrameOutcome = tuple[ProcessedFrame, SessionState] | Exception
 
 _LENGTH: Final = struct.Struct("<Q")
 
 
 @dataclass(frozen=True)
-class Setup:
-    """What a worker process begins with: `load` returns its warm engine, `log` says how it logs."""
+class WorkerSetup:
+    """The first message to a worker: `load` returns its warm engine, `log` is the configuration of its logging."""
 
     load: Callable[[], Engine]
     limits: ImageLimits
@@ -39,45 +38,44 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Job:
-    """A frame with all that is known of its camera; the other fields are those of `WorkerPool.open_camera`."""
+class FrameJob:
+    """A frame and the session it belongs to; `horizon` and `detector` are those of `WorkerPool.open_session`."""
 
     number: int
     frame: EncodedFrame
     state: SessionState
     horizon: float | None
-    detector: DetectorName | None
-    crowded: bool
+    detector: str | None
 
 
 @dataclass(frozen=True)
-class Done:
-    """What a job came to: lanes and the camera's new state, or an error; and the batches that ran meanwhile."""
+class FrameDone:
+    """The outcome of a job: lanes and the session's new state, or an error; and the batches that ran meanwhile."""
 
     number: int
-    outcome: Outcome
+    outcome: FrameOutcome
     batches: tuple[BatchReport, ...] = ()
 
 
-def packed(value: object) -> bytes:
-    """`value` as it is sent."""
+def encode_message(value: object) -> bytes:
+    """Returns `value` as it is sent."""
     body = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
     return _LENGTH.pack(len(body)) + body
 
 
-async def received(reader: asyncio.StreamReader) -> Any:
-    """The next value. Raises EOFError after the last one, and ConnectionError where the other end has gone."""
+async def read_message(reader: asyncio.StreamReader) -> Any:
+    """Returns the next message. Raises EOFError at the end, and ConnectionError if the other process is gone."""
     (length,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
-    return pickle.loads(await reader.readexactly(length))  # noqa: S301 - of our own process
+    return pickle.loads(await reader.readexactly(length))  # noqa: S301 - from our own process
 
 
-def receive(channel: socket.socket) -> Any:
-    """The next value, waited for. Raises EOFError after the last one."""
-    (length,) = _LENGTH.unpack(_exactly(channel, _LENGTH.size))
-    return pickle.loads(_exactly(channel, length))  # noqa: S301 - of our own process
+def receive_message(channel: socket.socket) -> Any:
+    """Returns the next message, blocking. Raises EOFError at the end."""
+    (length,) = _LENGTH.unpack(_receive_exactly(channel, _LENGTH.size))
+    return pickle.loads(_receive_exactly(channel, length))  # noqa: S301 - from our own process
 
 
-def _exactly(channel: socket.socket, length: int) -> bytearray:
+def _receive_exactly(channel: socket.socket, length: int) -> bytearray:
     data = bytearray(length)
     left = memoryview(data)
     while len(left):

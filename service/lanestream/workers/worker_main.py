@@ -1,7 +1,7 @@
 """The program of a worker process: frames in, lanes out, over the socket that the service started it with.
 
-It holds networks and nothing else: what is known of a camera comes with each frame and goes back with its lanes. Hence
-any process can take any frame, and one that ends takes nothing with it but the frames that it has in work.
+It holds the networks and nothing else: the session's state comes with each frame and goes back with its lanes. Hence any
+worker can take any frame, and one that ends loses only the frames that it was processing.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ import cv2
 from lanestream.errors import LanestreamError, one_line
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import FrameWorker
-from lanestream.workers.ipc import Done, Job, Setup, packed, receive
+from lanestream.workers.ipc import FrameDone, FrameJob, WorkerSetup, encode_message, receive_message
 
 if TYPE_CHECKING:
     from lanestream.engine import Engine
     from lanestream.images.decoding import ImageLimits
     from lanestream.inference.batcher import BatchReport
-    from lanestream.workers.ipc import Outcome
+    from lanestream.workers.ipc import FrameOutcome
 
 
 class WorkerProcess:
@@ -38,56 +38,56 @@ class WorkerProcess:
         self._channel = channel
         self._engine = engine
         self._batches: deque[BatchReport] = deque()
-        self._worker = FrameWorker(limits, self._batches.append)
+        self._worker = FrameWorker(engine.models, limits, self._batches.append)
         self._sending = threading.Lock()
 
     def serve(self) -> None:
-        """Capabilities what it has, is told how many threads it may use, and works until the service is gone."""
-        self._send(Capabilities.of(self._engine.pipelines))
-        with suppress(EOFError, ConnectionError), ThreadPoolExecutor(receive(self._channel)) as pool:
+        """Sends its capabilities, receives the number of threads, and works until the service closes the socket."""
+        self._send(Capabilities.of(self._engine))
+        with suppress(EOFError, ConnectionError), ThreadPoolExecutor(receive_message(self._channel)) as threads:
             while True:
-                pool.submit(self._answer, receive(self._channel))
+                threads.submit(self._process, receive_message(self._channel))
 
-    def _answer(self, job: Job) -> None:
-        outcome: Outcome
+    def _process(self, job: FrameJob) -> None:
+        outcome: FrameOutcome
         try:
             session = self._engine.open_session(job.horizon, job.detector)
             session.restore(job.state)
-            outcome = self._worker.lanes(session, job.frame, crowded=job.crowded), session.state
+            outcome = self._worker.process(session, job.frame), session.state
         except Exception as error:
             outcome = portable(error)
         batches = tuple(self._batches.popleft() for _ in range(len(self._batches)))
         with suppress(ConnectionError):
-            self._send(Done(job.number, outcome, batches))
+            self._send(FrameDone(job.number, outcome, batches))
 
     def _send(self, value: object) -> None:
-        parcel = packed(value)
+        message = encode_message(value)
         with self._sending:
-            self._channel.sendall(parcel)
+            self._channel.sendall(message)
 
 
 def portable(error: Exception) -> Exception:
-    """The error as another process can read it: one of ours as it is, any other by its name, with its traceback."""
+    """Returns an error that another process can read: ours as it is, any other by its name, with its traceback."""
     if isinstance(error, LanestreamError):
         return error
-    told = RuntimeError(f"{type(error).__name__}: {one_line(error)}")
-    told.add_note("".join(traceback.format_exception(error)))
-    return told
+    readable = RuntimeError(f"{type(error).__name__}: {one_line(error)}")
+    readable.add_note("".join(traceback.format_exception(error)))
+    return readable
 
 
 def main(descriptor: int) -> None:
     """Works for the service at the other end of the socket `descriptor`."""
-    # A signal for the whole group is the service's to answer: it drains, and closes the socket when it is done.
+    # The service handles signals for the whole process group: it drains, and closes the socket when it is done.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     with socket.socket(fileno=descriptor) as channel, suppress(EOFError, ConnectionError):
-        setup: Setup = receive(channel)
+        setup: WorkerSetup = receive_message(channel)
         logging.config.dictConfig(setup.log)
         cv2.setNumThreads(setup.opencv_threads)
         try:
             engine = setup.load()
         except Exception as error:
-            channel.sendall(packed(portable(error)))
+            channel.sendall(encode_message(portable(error)))
             return
         WorkerProcess(channel, engine, setup.limits).serve()
 

@@ -1,0 +1,59 @@
+"""What all detectors share: a detector takes one working image and returns the lane boundaries in it.
+
+It asks for network outputs through a callable that it is given, and knows nothing of runtimes, batches and threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanestream.road.curve import Curves
+from lanestream.road.results import Detection
+from lanestream.road.view import Image, RoadView
+
+ModelRole = Literal["classifier", "regressor"]
+
+# Returns the outputs (N, outputs) float32 of the model with that role for its inputs (N, size, size, 3) uint8 RGB.
+Infer = Callable[[ModelRole, NDArray[np.uint8]], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class FrameContext:
+    """What is known of a frame before it is looked at, in pixels of the working image.
+
+    `horizon` is its row, `tracked` are the boundaries of the last frame, and `prior_horizon` is the row that the ego-lane
+    prior of the last frame saw; each is None if unknown. The prior's row is the steadier one: boundaries on the road move
+    the other.
+    """
+
+    horizon: float | None = None
+    tracked: Curves | None = None
+    prior_horizon: float | None = None
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The boundaries of one frame from left to right, in pixels of the working image.
+
+    `view` has the horizon that fits them best, `horizon_weight` (0 to 1) is how much the frame says about its horizon,
+    `prior_horizon` the row for the next frame's context. `fit_s` are the seconds that fitting curves took.
+    """
+
+    boundaries: tuple[Detection, ...]
+    view: RoadView
+    horizon_weight: float
+    prior_horizon: float | None = None
+    fit_s: float = 0.0
+
+
+class Detector(Protocol):
+    """Finds lane boundaries. Detectors are immutable, and threads may share them."""
+
+    def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
+        """Returns the boundaries in a BGR working image (H, 640, 3) uint8."""
+        ...
