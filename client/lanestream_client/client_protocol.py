@@ -3,9 +3,9 @@
 A `ClientProtocol` keeps a few frames in flight, one by default: more would only queue in the service and make every
 result older, which pays off only if the network is slower than the service.
 
-A stream outlives its sockets. Each frame of the source gets exactly one result or is counted as dropped, whatever
-happens to a socket. After a connection was lost, mode `latest` reports the unanswered frames as lost. Mode `all` sends
-them again, except those that a resumed session has already processed: only their results are lost.
+A stream outlives its sockets: even if they break, each frame of the source gets exactly one result or is counted as
+dropped. After a connection was lost, mode `latest` reports the unanswered frames as lost. Mode `all` sends them again,
+except those that a resumed session has already processed: only their results are lost.
 """
 
 from __future__ import annotations

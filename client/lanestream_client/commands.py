@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from lanestream.protocol import LanesMessage
     from lanestream_client.in_process import LaneService, ResultStream
     from lanestream_client.sinks import ResultSink
-    from lanestream_client.sources import FrameSource
+    from lanestream_client.sources import CameraSource
 
 # Loads an engine from the model file, the name of the execution provider and the regressor file. Each may be None for
 # the default. Raises click.BadParameter if the provider is unknown.
@@ -220,7 +220,7 @@ class _StreamRun:
         self._info: ServiceInfo | None = None
         self._reconnects = 0
 
-    def process(self, start: Callable[..., ResultStream], source: FrameSource, mode: Mode) -> bool:
+    def process(self, start: Callable[..., ResultStream], source: CameraSource, mode: Mode) -> bool:
         """Streams the source. Returns whether the user interrupted it, which is how a live stream ends."""
         with ExitStack() as stack:
             advance = stack.enter_context(_progress_bar("frames", source.length))

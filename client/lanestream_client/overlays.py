@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Color = tuple[int, int, int]
 
-# Blue, green, red. People with red-green color blindness can tell these colors apart, too.
+# Blue, green, red. People with red-green color blindness can distinguish these colors, too.
 _EGO_LANE: Final[Color] = (150, 220, 60)
 _POSITIONS: Final[dict[int, tuple[Color, str]]] = {
     -2: ((200, 120, 220), "next left"),
@@ -62,8 +62,8 @@ class _Overlay:
 
     def text(self, text: str, at: tuple[float, float], color: Color, size: float = 0.55) -> None:
         """Writes `text` with its lower left corner `at`."""
-        place = round(at[0]), round(at[1])
-        cv2.putText(self.image, text, place, _FONT, size * self.scale, color, max(1, round(self.scale)), cv2.LINE_AA)
+        origin = round(at[0]), round(at[1])
+        cv2.putText(self.image, text, origin, _FONT, size * self.scale, color, max(1, round(self.scale)), cv2.LINE_AA)
 
     def text_width(self, text: str, size: float = 0.55) -> float:
         """Returns the width of `text` in pixels."""

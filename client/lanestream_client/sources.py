@@ -27,7 +27,7 @@ _NETWORK_TIMEOUT_S: Final = 10.0
 
 
 @dataclass(frozen=True)
-class FrameSource:
+class CameraSource:
     """The frames of one camera, to be read once.
 
     A `live` source delivers frames at its own pace; any other delivers them as fast as they are read. `length` is the
@@ -97,7 +97,7 @@ class NewestFrames:
                 self._changed.notify()
 
 
-def open_source(spec: str, fps: float = 25.0) -> AbstractContextManager[FrameSource]:
+def open_source(spec: str, fps: float = 25.0) -> AbstractContextManager[CameraSource]:
     """Opens the source that `spec` names. `fps` sets the timestamps of image files, which have none.
 
     Raises SourceError if the source does not exist or can't be read, and, while it is read, if it has no frames.
@@ -132,7 +132,7 @@ def _without_login(url: str) -> str:
 
 
 @contextmanager
-def _images(name: str, files: list[Path], fps: float) -> Iterator[FrameSource]:
+def _images(name: str, files: list[Path], fps: float) -> Iterator[CameraSource]:
     def frames() -> Iterator[SourceFrame]:
         for seq, path in enumerate(files):
             try:
@@ -140,11 +140,11 @@ def _images(name: str, files: list[Path], fps: float) -> Iterator[FrameSource]:
             except OSError as error:
                 raise SourceError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
 
-    yield FrameSource(name, frames(), live=False, fps=fps, length=len(files))
+    yield CameraSource(name, frames(), live=False, fps=fps, length=len(files))
 
 
 @contextmanager
-def _video(location: str, name: str) -> Iterator[FrameSource]:
+def _video(location: str, name: str) -> Iterator[CameraSource]:
     """Opens a video file or a network stream. A network stream without a known duration is live."""
     with needs_extra("video"):
         import av
@@ -161,7 +161,7 @@ def _video(location: str, name: str) -> Iterator[FrameSource]:
         stream.thread_type = "AUTO"
         fps = float(stream.average_rate or stream.guessed_rate or 25)
         live = remote and container.duration is None
-        yield FrameSource(name, _decoded(container, name, fps), live=live, fps=fps, length=stream.frames or None)
+        yield CameraSource(name, _decoded(container, name, fps), live=live, fps=fps, length=stream.frames or None)
 
 
 def _decoded(container: av.container.InputContainer, name: str, fps: float) -> Iterator[SourceFrame]:
@@ -191,14 +191,14 @@ def _reason(error: Exception) -> str:
 
 
 @contextmanager
-def _camera(number: int) -> Iterator[FrameSource]:
+def _camera(number: int) -> Iterator[CameraSource]:
     with needs_extra("video"):
         import cv2
     capture = cv2.VideoCapture(number)
     try:
         if not capture.isOpened():
             raise SourceError(f"camera {number} was not found, or another program uses it", _HINT)
-        yield FrameSource(
+        yield CameraSource(
             f"camera {number}", _captured(capture, number), live=True, fps=capture.get(cv2.CAP_PROP_FPS) or 30.0
         )
     finally:

@@ -1,4 +1,4 @@
-"""Each frame of a stream gets exactly one result or is counted as dropped, whatever happens to its sockets."""
+"""Each frame of a stream gets exactly one result or is counted as dropped, even if sockets break at random."""
 
 from __future__ import annotations
 
