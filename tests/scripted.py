@@ -1,4 +1,4 @@
-"""A service that plays a script: one act for each connection that comes, so that it breaks where a test wants it."""
+"""A fake service that follows a script: one step for each connection, so that it fails where a test wants it to."""
 
 from __future__ import annotations
 
@@ -20,104 +20,108 @@ from lanestream.errors import LanestreamError, answer_to
 from lanestream.protocol import DrainingMessage, SummaryMessage, error_message
 
 
-class Visit:
-    """One connection, from the service's side."""
+class ScriptedConnection:
+    """The service's side of one connection."""
 
     def __init__(self, connection: ServerConnection, script: Script) -> None:
         self._connection = connection
         self._script = script
 
     def open(self, **ready: Any) -> None:
-        """Takes `start`, which the script keeps, and answers it."""
+        """Receives `start`, records it in the script and answers `ready`."""
         text = self._connection.recv(fakes.WAIT_S)
         assert isinstance(text, str)
         self._script.starts.append(json.loads(text))
         self._connection.send(fakes.ready(**ready).model_dump_json())
 
-    def frame(self) -> int:
-        """Takes a frame, or the end; the frame's number, -1 for the end."""
-        announced = json.loads(self._connection.recv(fakes.WAIT_S))
-        if announced["type"] == "end":
+    def receive_frame(self) -> int:
+        """Receives a frame and returns its number. Returns -1 for `end`."""
+        header = json.loads(self._connection.recv(fakes.WAIT_S))
+        if header["type"] == "end":
             return -1
         assert isinstance(self._connection.recv(fakes.WAIT_S), bytes)
-        return int(announced["seq"])
+        return int(header["seq"])
 
-    def answer(self, *numbers: int) -> None:
+    def send_lanes(self, *numbers: int) -> None:
+        """Answers frames."""
         for seq in numbers:
             self._connection.send(fakes.lanes(seq).model_dump_json())
 
-    def refuse(self, error: LanestreamError, seq: int | None = None) -> None:
-        """Tells of an error: a frame's, or one that ends the stream."""
+    def send_error(self, error: LanestreamError, seq: int | None = None) -> None:
+        """Sends the error of a frame, or one that ends the stream if `seq` is None."""
         self._connection.send(error_message(error, seq=seq, fatal=seq is None).model_dump_json())
 
     def drain(self) -> None:
+        """Announces that the service is about to stop."""
         self._connection.send(DrainingMessage(resume_token="later", deadline_s=5.0).model_dump_json())  # noqa: S106
 
     def close(self, code: int) -> None:
+        """Closes the connection properly."""
         self._connection.close(code)
 
     def break_off(self) -> None:
-        """Ends without a goodbye, as a process that is killed."""
+        """Breaks the connection without a close frame, as a killed process does."""
         self._connection.socket.shutdown(socket.SHUT_RDWR)
 
     def finish(self) -> None:
-        """Answers what comes until the end, as a service that is well."""
-        while (seq := self.frame()) >= 0:
-            self.answer(seq)
+        """Answers all frames until `end`, then sends the summary and closes."""
+        while (seq := self.receive_frame()) >= 0:
+            self.send_lanes(seq)
         self._connection.send(
             SummaryMessage(frames=0, answered=0, failed=0, dropped=0, duration_s=0.0).model_dump_json()
         )
         self._connection.close()
 
 
-Act = Callable[[Visit], None] | LanestreamError
+# Handles a connection, or refuses its handshake with an error.
+ScriptStep = Callable[[ScriptedConnection], None] | LanestreamError
 
 
 @dataclass
 class Script:
-    """The acts that are still to come, and what refuses every connection after them.
+    """The remaining steps, and the error that refuses every connection after them.
 
-    It keeps what the clients began with, in which headers, and what went wrong.
+    Records the clients' `start` messages and handshake headers, and the exceptions of steps.
     """
 
-    acts: list[Act]
-    then: LanestreamError | None = None
+    steps: list[ScriptStep]
+    refuse_later: LanestreamError | None = None
     url: str = ""
     starts: list[dict[str, Any]] = field(default_factory=list)
     headers: list[dict[str, str]] = field(default_factory=list)
     failures: list[BaseException] = field(default_factory=list)
 
-    def receive(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuses the handshake where the act is an error, and lets it pass otherwise."""
+    def process_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuses the handshake if the next step is an error."""
         self.headers.append(dict(request.headers.raw_items()))
-        act = self.acts[0] if self.acts else self.then
-        assert act is not None, "nobody was to come any more"
-        if not isinstance(act, LanestreamError):
+        step = self.steps[0] if self.steps else self.refuse_later
+        assert step is not None, "unexpected connection"
+        if not isinstance(step, LanestreamError):
             return None
-        del self.acts[:1]
-        body = json.dumps({"code": act.code, "message": act.message, "hint": act.hint})
-        return connection.respond(HTTPStatus(answer_to(act).http_status), body)
+        del self.steps[:1]
+        body = json.dumps({"code": step.code, "message": step.message, "hint": step.hint})
+        return connection.respond(HTTPStatus(answer_to(step).http_status), body)
 
-    def play(self, connection: ServerConnection) -> None:
-        """One connection."""
-        act = self.acts.pop(0)
-        assert not isinstance(act, LanestreamError)
+    def handle(self, connection: ServerConnection) -> None:
+        """Runs the next step on a connection."""
+        step = self.steps.pop(0)
+        assert not isinstance(step, LanestreamError)
         try:
-            act(Visit(connection, self))
+            step(ScriptedConnection(connection, self))
         except ConnectionClosed:
-            pass  # as a client does that gives up
+            pass  # the client may give up
         except BaseException as error:
             self.failures.append(error)
 
 
 @contextmanager
-def scripted(*acts: Act, then: LanestreamError | None = None) -> Iterator[Script]:
-    """A service that plays the acts in turn, then refuses with `then`.
+def scripted(*steps: ScriptStep, refuse_later: LanestreamError | None = None) -> Iterator[Script]:
+    """Runs a service that follows the steps, then refuses connections with `refuse_later`.
 
-    Fails where they were not all played, or one of them failed.
+    Fails if a step failed or was not reached.
     """
-    script = Script(list(acts), then)
-    with serve(script.play, "127.0.0.1", 0, process_request=script.receive, compression=None) as server:
+    script = Script(list(steps), refuse_later)
+    with serve(script.handle, "127.0.0.1", 0, process_request=script.process_request, compression=None) as server:
         script.url = f"http://127.0.0.1:{server.socket.getsockname()[1]}"
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
@@ -127,10 +131,10 @@ def scripted(*acts: Act, then: LanestreamError | None = None) -> Iterator[Script
             server.shutdown()
             thread.join(fakes.WAIT_S)
     assert script.failures == []
-    assert script.acts == []
+    assert script.steps == []
 
 
 def refused_url() -> str:
-    """The URL of a port that nobody listens on."""
+    """Returns the URL of a port that no process listens on."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return f"http://127.0.0.1:{probe.getsockname()[1]}"

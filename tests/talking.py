@@ -1,4 +1,4 @@
-"""Talking to a stream by hand, message by message."""
+"""Raw WebSocket helpers for tests that send and receive single stream messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lanestream.protocol import parse_server_message
 
 @contextmanager
 def stream(url: str, **start: Any) -> Iterator[ClientConnection]:
-    """A stream that was opened with `start`, or not at all."""
+    """Connects a stream. Opens it with a `start` message if there are arguments for one."""
     with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
         if start:
             tell(socket, "start", **start)
@@ -27,13 +27,13 @@ def stream(url: str, **start: Any) -> Iterator[ClientConnection]:
         yield socket
 
 
-def tell(socket: ClientConnection, kind: str, **more: Any) -> None:
-    """Sends a message of a kind."""
-    socket.send(json.dumps({"type": kind, **more}))
+def tell(socket: ClientConnection, kind: str, **fields: Any) -> None:
+    """Sends a message of type `kind`."""
+    socket.send(json.dumps({"type": kind, **fields}))
 
 
 def heard(socket: ClientConnection) -> dict[str, Any]:
-    """The next message, which is one of the protocol."""
+    """Returns the next message, after checking it against the protocol."""
     text = socket.recv(fakes.WAIT_S)
     assert isinstance(text, str)
     parse_server_message(text)
@@ -42,7 +42,7 @@ def heard(socket: ClientConnection) -> dict[str, Any]:
 
 
 def closed(socket: ClientConnection) -> tuple[int, str]:
-    """The code and the reason that the service closed with, and no message before."""
+    """Returns the code and the reason with which the service closes. Fails if a message comes before."""
     with pytest.raises(ConnectionClosed) as caught:
         socket.recv(fakes.WAIT_S)
     assert caught.value.rcvd is not None
@@ -50,14 +50,14 @@ def closed(socket: ClientConnection) -> tuple[int, str]:
 
 
 def all_was_read(socket: ClientConnection) -> None:
-    """Returns when the service has taken in all that was sent before: it answers text at once, and in order."""
+    """Waits until the service has read all earlier messages: it answers text immediately and in order."""
     socket.send("?")
     assert heard(socket)["code"] == "bad_message"
 
 
 def all_released(url: str, **headers: str) -> None:
-    """Returns when no stream has a session any more: a service lets go of one after its client is gone."""
-    ends = time.monotonic() + fakes.WAIT_S
+    """Waits until no stream has a session: the service releases one only after its client has gone."""
+    deadline = time.monotonic() + fakes.WAIT_S
     while "lane_sessions_active 0.0" not in httpx.get(f"{url}/metrics", headers=headers).text:
-        assert time.monotonic() < ends
+        assert time.monotonic() < deadline
         time.sleep(0.005)

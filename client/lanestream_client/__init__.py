@@ -1,4 +1,4 @@
-"""The Lanestream client: frames to a service, lane lines back."""
+"""The Lanestream client: sends frames to a service and receives lane lines."""
 
 from lanestream.protocol import CameraModel
 from lanestream_client.async_client import AsyncLaneClient, AsyncLaneStream

@@ -1,4 +1,4 @@
-"""The client that awaits. Inside, one task reads the source and one sends, while the caller receives."""
+"""The async client. For each stream one task reads the source, one sends, and the caller's task receives."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import aclosing, asynccontextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Self
 
 import httpx
 from websockets.asyncio.client import ClientConnection, connect
@@ -16,35 +17,37 @@ from websockets.exceptions import ConnectionClosed
 
 from lanestream.errors import LanestreamError
 from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage
-from lanestream_client import handshake, requests
+from lanestream_client import requests
 from lanestream_client.client_protocol import ClientProtocol
-from lanestream_client.endpoint import endpoints
-from lanestream_client.failover import PASSING, Patience, Route
-from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
-from lanestream_client.service import ServiceInfo, as_frames
-
-_TIMEOUT_S: Final = 30.0
-
-Frames = AsyncIterable[SourceFrame] | Iterable[SourceFrame | bytes]
+from lanestream_client.endpoint import (
+    READY_TIMEOUT_S,
+    connect_options,
+    http_errors,
+    parse_endpoints,
+    websocket_errors,
+)
+from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
+from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
+from lanestream_client.requests import ServiceInfo
 
 
 class AsyncLaneClient:
-    """What LaneClient does, for programs that await: the same arguments, results and errors."""
+    """The async version of LaneClient, with the same arguments, results and errors."""
 
     def __init__(
         self,
         url: str | Sequence[str] = "http://127.0.0.1:8000",
-        timeout: float = _TIMEOUT_S,
+        timeout: float = 30.0,
         in_flight: int = 1,
         *,
         api_key: str | None = None,
-        reconnect_s: float = Patience.total_s,
+        reconnect_s: float = RetryPolicy.total_s,
     ) -> None:
-        self._replicas = deque(endpoints(url, api_key))  # the one that answered last comes first
+        self._endpoints = deque(parse_endpoints(url, api_key))  # the replica that answered last comes first
         self._timeout = timeout
         self._in_flight = in_flight
-        self._patience = Patience(reconnect_s)
-        self._http = httpx.AsyncClient(timeout=timeout, headers=self._replicas[0].headers)
+        self._retry = RetryPolicy(reconnect_s)
+        self._http = httpx.AsyncClient(timeout=timeout, headers=self._endpoints[0].headers)
 
     async def __aenter__(self) -> Self:
         return self
@@ -55,12 +58,16 @@ class AsyncLaneClient:
         await self.close()
 
     async def close(self) -> None:
-        """Closes the connections that are kept for further requests."""
+        """Closes the HTTP connections that were kept open for further requests."""
         await self._http.aclose()
 
     async def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
-        """The model that the service runs for a detector, for its default one where None, and what runs it."""
-        return requests.info_of(await self._answer(lambda place: self._http.get(f"{place}/v1/models")), detector)
+        """Returns the model behind a detector and the provider that runs it; of the default detector if None.
+
+        Raises NoDetectorError if the service has not loaded the detector.
+        """
+        response = await self._request(lambda base: self._http.get(f"{base}/v1/models"))
+        return requests.parse_service_info(response, detector)
 
     async def detect(
         self,
@@ -70,19 +77,19 @@ class AsyncLaneClient:
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
     ) -> LanesMessage:
-        """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height.
+        """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, or its path.
 
-        `detector` says what finds them, the service's default where None. With a `camera` they are told in metres too.
+        `horizon` is the row of the horizon as a share of the image height, estimated if None. `detector` defaults to
+        the service's. With a `camera` the lanes are also given in meters. Raises SourceError if the file can't be read.
         """
-        data = await asyncio.to_thread(requests.image_bytes, image)
-        query = requests.parameters(horizon, detector, camera)
-        return requests.lanes_of(
-            await self._answer(lambda place: self._http.post(f"{place}/v1/detect", content=data, params=query))
-        )
+        data = await asyncio.to_thread(requests.read_image_file, image)
+        query = requests.detect_query(horizon, detector, camera)
+        response = await self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
+        return requests.parse_lanes(response)
 
     def stream(
         self,
-        frames: Frames,
+        frames: AsyncIterable[SourceFrame] | Iterable[SourceFrame | bytes],
         *,
         mode: Mode = "latest",
         horizon: float | None = None,
@@ -90,111 +97,109 @@ class AsyncLaneClient:
         camera: CameraModel | None = None,
         session: str | None = None,
     ) -> AsyncLaneStream:
-        """The lanes of the frames of one camera, in their order, as they come; see LaneClient.stream.
+        """Returns the results of one camera's frames, in frame order, as they arrive; see LaneClient.stream.
 
-        A source that is no async iterable is read in a thread, because it may block.
+        A source that is not an async iterable is read in a thread, because it may block.
         """
-        source = frames if isinstance(frames, AsyncIterable) else _in_thread(frames)
-        start = requests.start(mode, horizon, detector, camera, session)
-        route = Route(self._replicas, self._patience, self._timeout)
-        return AsyncLaneStream(route, source, ClientProtocol(start, in_flight=self._in_flight))
+        source = frames if isinstance(frames, AsyncIterable) else _read_in_thread(frames)
+        start = requests.start_message(mode, horizon, detector, camera, session)
+        failover = FailoverPolicy(self._endpoints, self._retry, self._timeout)
+        return AsyncLaneStream(failover, source, ClientProtocol(start, in_flight=self._in_flight))
 
-    async def _answer(self, ask: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
-        """The good answer of the first replica that gives one. Raises the last one's error where none does."""
-        for _ in range(len(self._replicas) - 1):
-            with suppress(*PASSING):
-                return await self._answer_of_first(ask)
-            self._replicas.rotate(-1)
-        return await self._answer_of_first(ask)
+    async def _request(self, send: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
+        """Returns the first successful response of a replica. Raises the last replica's error if all fail."""
+        for _ in range(len(self._endpoints) - 1):
+            with suppress(*RETRYABLE):
+                return await self._request_from_first(send)
+            self._endpoints.rotate(-1)
+        return await self._request_from_first(send)
 
-    async def _answer_of_first(self, ask: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
-        replica = self._replicas[0]
-        with requests.reaching(replica.base):
-            return requests.checked(await ask(replica.http))
+    async def _request_from_first(self, send: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
+        endpoint = self._endpoints[0]
+        with http_errors(endpoint):
+            return requests.check_response(await send(endpoint.http))
 
 
 class AsyncLaneStream:
-    """The results of one stream: connects when iterated, which can be done once."""
+    """The results of one stream. Connects when iterated over, which is possible once."""
 
-    def __init__(self, route: Route, frames: AsyncIterable[SourceFrame], conversation: ClientProtocol) -> None:
-        self._route = route
+    def __init__(self, failover: FailoverPolicy, frames: AsyncIterable[SourceFrame], protocol: ClientProtocol) -> None:
+        self._failover = failover
         self._frames = frames
-        self._conversation = conversation
+        self._protocol = protocol
 
     @property
     def ready(self) -> ReadyMessage | None:
-        """What the service said when it opened the stream last; None before."""
-        return self._conversation.ready
+        """The `ready` message of the latest connection, or None before the first."""
+        return self._protocol.ready
 
     @property
     def reconnects(self) -> int:
         """How often the stream was opened again after its connection was lost."""
-        return self._conversation.reconnects
+        return self._protocol.reconnects
 
     @property
     def summary(self) -> StreamSummary | None:
-        """What became of the frames, over all connections; None before the end."""
-        return self._conversation.summary
+        """The frame counts over all connections, or None before the end."""
+        return self._protocol.summary
 
     async def __aiter__(self) -> AsyncIterator[StreamResult]:
-        conversation = self._conversation
-        async with _Exchange(conversation, self._frames) as exchange:
-            while conversation.summary is None:
+        async with _StreamTasks(self._protocol, self._frames) as tasks:
+            while self._protocol.summary is None:
                 failure = None
                 try:
-                    async with aclosing(self._over_one_socket(exchange)) as results:
+                    async with aclosing(self._results_of_connection(tasks)) as results:
                         async for result in results:
                             yield result
                 except LanestreamError as error:
                     failure = error
-                if failure is None:
-                    continue
-                pause = self._route.after(failure, leaving=conversation.is_draining)
-                for result in await exchange.do(
-                    conversation.given_up if pause is None else conversation.lost_connection
-                ):
-                    yield result
-                if pause is None:
-                    raise failure
-                if conversation.summary is None:
-                    await asyncio.sleep(pause)
-            exchange.check()
+                if failure is not None:
+                    async with aclosing(self._handle_failure(failure, tasks)) as results:
+                        async for result in results:
+                            yield result
+            tasks.raise_source_error()
 
-    async def _over_one_socket(self, exchange: _Exchange) -> AsyncGenerator[StreamResult]:
-        timeout = self._route.timeout_s
-        async with _connected(self._route, timeout) as socket:
-            await socket.send(self._conversation.opening())
-            text = await asyncio.wait_for(socket.recv(), max(timeout, handshake.READY_S))
-            results = await exchange.take_in(self._conversation.opened, text)
-            self._route.connected()
-            async with exchange.sending_over(socket):
-                for result in results:
-                    yield result
-                while self._conversation.summary is None:
-                    results = await exchange.take_in(self._conversation.incoming, await socket.recv())
-                    if results:
-                        self._route.progressed()
+    async def _results_of_connection(self, tasks: _StreamTasks) -> AsyncGenerator[StreamResult]:
+        """Yields results until the stream has finished. Raises LanestreamError if the connection fails."""
+        protocol, failover, timeout = self._protocol, self._failover, self._failover.timeout_s
+        with websocket_errors(failover.endpoint):
+            async with connect(**connect_options(failover.endpoint, timeout)) as socket:
+                await socket.send(protocol.start_message())
+                answer = await asyncio.wait_for(socket.recv(), max(timeout, READY_TIMEOUT_S))
+                results = await tasks.locked(partial(protocol.receive_ready, answer))
+                failover.connected()
+                async with tasks.sending_to(socket):
                     for result in results:
                         yield result
+                    while protocol.summary is None:
+                        results = await tasks.locked(partial(protocol.receive, await socket.recv()))
+                        if results:
+                            failover.progressed()
+                        for result in results:
+                            yield result
+
+    async def _handle_failure(self, failure: LanestreamError, tasks: _StreamTasks) -> AsyncGenerator[StreamResult]:
+        """Yields the results that were lost and waits for the next attempt. Raises `failure` if there is none."""
+        pause = self._failover.pause_after(failure, draining=self._protocol.is_draining)
+        if pause is None:
+            for result in await tasks.locked(self._protocol.give_up):
+                yield result
+            raise failure
+        for result in await tasks.locked(self._protocol.connection_lost):
+            yield result
+        if self._protocol.summary is None:
+            await asyncio.sleep(pause)
 
 
-@asynccontextmanager
-async def _connected(route: Route, timeout: float) -> AsyncIterator[ClientConnection]:
-    endpoint = route.endpoint
-    with handshake.telling(endpoint):
-        async with connect(**handshake.options(endpoint, timeout)) as socket:
-            yield socket
+class _StreamTasks:
+    """The tasks of one stream, which share its protocol: one reads the source, and one per connection sends."""
 
-
-class _Exchange:
-    """Where three tasks share one conversation: the source's and, for each socket, the sender's, and the caller's."""
-
-    def __init__(self, conversation: ClientProtocol, frames: AsyncIterable[SourceFrame]) -> None:
-        self._conversation = conversation
+    def __init__(self, protocol: ClientProtocol, frames: AsyncIterable[SourceFrame]) -> None:
+        self._protocol = protocol
         self._frames = frames
         self._changed = asyncio.Condition()
-        self._failure: Exception | None = None
-        self._source: asyncio.Task[None] | None = None
+        self._source_error: Exception | None = None
+        self._reader: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         return self
@@ -202,72 +207,68 @@ class _Exchange:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
     ) -> None:
-        if self._source is not None:
-            await _cancelled(self._source)
+        if self._reader is not None:
+            await _cancel(self._reader)
 
-    async def do(self, act: Callable[[], list[StreamResult]]) -> list[StreamResult]:
-        """Calls a method of the conversation, and has the other tasks look what it changed."""
+    async def locked(self, call: Callable[[], list[StreamResult]]) -> list[StreamResult]:
+        """Calls a method of the protocol under the lock, then wakes the other tasks."""
         async with self._changed:
-            results = act()
+            results = call()
             self._changed.notify_all()
         return results
 
-    async def take_in(self, act: Callable[[str | bytes], list[StreamResult]], text: str | bytes) -> list[StreamResult]:
-        """Hands a message to a method of the conversation, and has the other tasks look what it changed."""
-        return await self.do(lambda: act(text))
-
     @asynccontextmanager
-    async def sending_over(self, socket: ClientConnection) -> AsyncIterator[None]:
-        """Sends what there is to send, in the block. The source is read from the first block on."""
+    async def sending_to(self, socket: ClientConnection) -> AsyncIterator[None]:
+        """Sends the protocol's messages to `socket` during the block. The first call starts to read the source."""
         sender = asyncio.create_task(self._send(socket))
-        if self._source is None:
-            self._source = asyncio.create_task(self._read())
+        if self._reader is None:
+            self._reader = asyncio.create_task(self._read_source())
         try:
             yield
         finally:
-            await _cancelled(sender)
+            await _cancel(sender)
 
-    def check(self) -> None:
-        """Raises what the source failed with, after all that came before it was answered."""
-        if self._failure is not None:
-            raise self._failure
+    def raise_source_error(self) -> None:
+        """Raises the exception of the source, if any. To be called after all frames before it have their results."""
+        if self._source_error is not None:
+            raise self._source_error
 
     async def _send(self, socket: ClientConnection) -> None:
-        # The receiving side meets a closed connection too, and tells it.
+        # The receiving task meets the closed connection too, and reports it.
         with suppress(ConnectionClosed):
             while True:
                 for message in await self._next_messages():
                     await socket.send(message)
 
     async def _next_messages(self) -> list[str | bytes]:
-        """What to send next, as soon as there is something."""
+        """Waits for messages to send and returns them."""
         async with self._changed:
-            while not (messages := self._conversation.outgoing()):
+            while not (messages := self._protocol.messages_to_send()):
                 await self._changed.wait()
             self._changed.notify_all()
         return messages
 
-    async def _read(self) -> None:
+    async def _read_source(self) -> None:
         try:
             async for frame in self._frames:
                 data = frame.data if frame.data is not None else await asyncio.to_thread(frame.encoded)
                 async with self._changed:
-                    self._conversation.offer(frame, data)
+                    self._protocol.add_frame(frame, data)
                     self._changed.notify_all()
-                    await self._changed.wait_for(lambda: self._conversation.wants_frame)
+                    await self._changed.wait_for(lambda: self._protocol.wants_frame)
         except Exception as error:
-            self._failure = error
+            self._source_error = error
         async with self._changed:
-            self._conversation.no_more()
+            self._protocol.end_source()
             self._changed.notify_all()
 
 
-async def _cancelled(task: asyncio.Task[None]) -> None:
+async def _cancel(task: asyncio.Task[None]) -> None:
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def _in_thread(frames: Iterable[SourceFrame | bytes]) -> AsyncIterator[SourceFrame]:
-    iterator = as_frames(frames)
+async def _read_in_thread(frames: Iterable[SourceFrame | bytes]) -> AsyncIterator[SourceFrame]:
+    iterator = as_source_frames(frames)
     while (frame := await asyncio.to_thread(next, iterator, None)) is not None:
         yield frame

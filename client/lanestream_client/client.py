@@ -1,4 +1,4 @@
-"""The client that blocks. Inside, one thread reads the source and one sends, while the caller receives."""
+"""The blocking client. For each stream one thread reads the source, one sends, and the caller's thread receives."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Self
 
 import httpx
 from websockets.exceptions import ConnectionClosed
@@ -17,41 +18,45 @@ from websockets.sync.client import ClientConnection, connect
 
 from lanestream.errors import LanestreamError
 from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage
-from lanestream_client import handshake, requests
+from lanestream_client import requests
 from lanestream_client.client_protocol import ClientProtocol
-from lanestream_client.endpoint import endpoints
-from lanestream_client.failover import PASSING, Patience, Route
-from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
-from lanestream_client.service import ServiceInfo, as_frames
-
-_TIMEOUT_S: Final = 30.0
+from lanestream_client.endpoint import (
+    READY_TIMEOUT_S,
+    connect_options,
+    http_errors,
+    parse_endpoints,
+    websocket_errors,
+)
+from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
+from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
+from lanestream_client.requests import ServiceInfo
 
 
 class LaneClient:
-    """A Lanestream service at `url`, or its replicas at several. `api_key` opens it where it asks for one.
+    """A client of the Lanestream service at `url`, or of its replicas at several URLs.
 
-    Waits `timeout` seconds for a connection and for a single image's answer. Of a stream, `in_flight` frames are
-    unanswered at a time: one gives the freshest answers, a few hide a slow network. A stream whose connection is lost
-    is opened again, on whichever replica is there, for `reconnect_s` seconds without one; 0 lets it end.
+    `timeout` limits, in seconds, a first connection and the response to a single image. A stream keeps up to
+    `in_flight` frames unanswered: one gives the freshest results, a few hide a slow network. A stream that loses its
+    connection reconnects to any replica, and ends after `reconnect_s` seconds without a connection; 0 disables this.
 
-    Raises SettingsError where a URL or the key is none, ConnectionFailedError where the service can't be reached or is
-    lost, and the errors that the service tells, as the classes of `lanestream.errors`.
+    Raises SettingsError if a URL or `api_key` is not valid. The methods raise ConnectionFailedError if the service
+    can't be reached or is lost, and the errors that the service sends, as the classes of `lanestream.errors`.
     """
 
     def __init__(
         self,
         url: str | Sequence[str] = "http://127.0.0.1:8000",
-        timeout: float = _TIMEOUT_S,
+        timeout: float = 30.0,
         in_flight: int = 1,
         *,
         api_key: str | None = None,
-        reconnect_s: float = Patience.total_s,
+        reconnect_s: float = RetryPolicy.total_s,
     ) -> None:
-        self._replicas = deque(endpoints(url, api_key))  # the one that answered last comes first
+        self._endpoints = deque(parse_endpoints(url, api_key))  # the replica that answered last comes first
         self._timeout = timeout
         self._in_flight = in_flight
-        self._patience = Patience(reconnect_s)
-        self._http = httpx.Client(timeout=timeout, headers=self._replicas[0].headers)
+        self._retry = RetryPolicy(reconnect_s)
+        self._http = httpx.Client(timeout=timeout, headers=self._endpoints[0].headers)
 
     def __enter__(self) -> Self:
         return self
@@ -60,12 +65,16 @@ class LaneClient:
         self.close()
 
     def close(self) -> None:
-        """Closes the connections that are kept for further requests."""
+        """Closes the HTTP connections that were kept open for further requests."""
         self._http.close()
 
     def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
-        """The model that the service runs for a detector, for its default one where None, and what runs it."""
-        return requests.info_of(self._answer(lambda place: self._http.get(f"{place}/v1/models")), detector)
+        """Returns the model behind a detector and the provider that runs it; of the default detector if None.
+
+        Raises NoDetectorError if the service has not loaded the detector.
+        """
+        response = self._request(lambda base: self._http.get(f"{base}/v1/models"))
+        return requests.parse_service_info(response, detector)
 
     def detect(
         self,
@@ -75,15 +84,15 @@ class LaneClient:
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
     ) -> LanesMessage:
-        """The lanes of one image: a JPEG, PNG or WebP file, or its path; `horizon` as a share of the image height.
+        """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, or its path.
 
-        `detector` says what finds them, the service's default where None. With a `camera` they are told in metres too.
+        `horizon` is the row of the horizon as a share of the image height, estimated if None. `detector` defaults to
+        the service's. With a `camera` the lanes are also given in meters. Raises SourceError if the file can't be read.
         """
-        data = requests.image_bytes(image)
-        query = requests.parameters(horizon, detector, camera)
-        return requests.lanes_of(
-            self._answer(lambda place: self._http.post(f"{place}/v1/detect", content=data, params=query))
-        )
+        data = requests.read_image_file(image)
+        query = requests.detect_query(horizon, detector, camera)
+        response = self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
+        return requests.parse_lanes(response)
 
     def stream(
         self,
@@ -95,108 +104,106 @@ class LaneClient:
         camera: CameraModel | None = None,
         session: str | None = None,
     ) -> LaneStream:
-        """The lanes of the frames of one camera, in their order, as they come; `detector` and `camera` as for `detect`.
+        """Returns the results of one camera's frames, in frame order, as they arrive.
 
-        A frame that the service refuses, or whose answer is lost with a connection, gives a result with an `error`, and
-        the stream goes on. `session` names it in the service's logs. Raises ProtocolError where an argument is no good.
+        `horizon`, `detector` and `camera` are as for `detect`; `session` is a name for the service's logs. A frame that
+        the service refuses, or whose result is lost with a connection, yields a result with an `error`, and the stream
+        continues. Raises ProtocolError if an argument is not valid.
         """
-        start = requests.start(mode, horizon, detector, camera, session)
-        route = Route(self._replicas, self._patience, self._timeout)
-        return LaneStream(route, as_frames(frames), ClientProtocol(start, in_flight=self._in_flight))
+        start = requests.start_message(mode, horizon, detector, camera, session)
+        failover = FailoverPolicy(self._endpoints, self._retry, self._timeout)
+        return LaneStream(failover, as_source_frames(frames), ClientProtocol(start, in_flight=self._in_flight))
 
-    def _answer(self, ask: Callable[[str], httpx.Response]) -> httpx.Response:
-        """The good answer of the first replica that gives one. Raises the last one's error where none does."""
-        for _ in range(len(self._replicas) - 1):
-            with suppress(*PASSING):
-                return self._answer_of_first(ask)
-            self._replicas.rotate(-1)
-        return self._answer_of_first(ask)
+    def _request(self, send: Callable[[str], httpx.Response]) -> httpx.Response:
+        """Returns the first successful response of a replica. Raises the last replica's error if all fail."""
+        for _ in range(len(self._endpoints) - 1):
+            with suppress(*RETRYABLE):
+                return self._request_from_first(send)
+            self._endpoints.rotate(-1)
+        return self._request_from_first(send)
 
-    def _answer_of_first(self, ask: Callable[[str], httpx.Response]) -> httpx.Response:
-        replica = self._replicas[0]
-        with requests.reaching(replica.base):
-            return requests.checked(ask(replica.http))
+    def _request_from_first(self, send: Callable[[str], httpx.Response]) -> httpx.Response:
+        endpoint = self._endpoints[0]
+        with http_errors(endpoint):
+            return requests.check_response(send(endpoint.http))
 
 
 class LaneStream:
-    """The results of one stream: connects when iterated, which can be done once."""
+    """The results of one stream. Connects when iterated over, which is possible once."""
 
-    def __init__(self, route: Route, frames: Iterator[SourceFrame], conversation: ClientProtocol) -> None:
-        self._route = route
+    def __init__(self, failover: FailoverPolicy, frames: Iterator[SourceFrame], protocol: ClientProtocol) -> None:
+        self._failover = failover
         self._frames = frames
-        self._conversation = conversation
+        self._protocol = protocol
 
     @property
     def ready(self) -> ReadyMessage | None:
-        """What the service said when it opened the stream last; None before."""
-        return self._conversation.ready
+        """The `ready` message of the latest connection, or None before the first."""
+        return self._protocol.ready
 
     @property
     def reconnects(self) -> int:
         """How often the stream was opened again after its connection was lost."""
-        return self._conversation.reconnects
+        return self._protocol.reconnects
 
     @property
     def summary(self) -> StreamSummary | None:
-        """What became of the frames, over all connections; None before the end."""
-        return self._conversation.summary
+        """The frame counts over all connections, or None before the end."""
+        return self._protocol.summary
 
     def __iter__(self) -> Generator[StreamResult]:
-        conversation = self._conversation
-        with _Exchange(conversation, self._frames) as exchange:
-            while conversation.summary is None:
+        with _StreamThreads(self._protocol, self._frames) as threads:
+            while self._protocol.summary is None:
                 failure = None
                 try:
-                    yield from self._over_one_socket(exchange)
+                    yield from self._results_of_connection(threads)
                 except LanestreamError as error:
                     failure = error
                 if failure is not None:
-                    yield from self._after(failure, exchange)
-            exchange.check()
+                    yield from self._handle_failure(failure, threads)
+            threads.raise_source_error()
 
-    def _over_one_socket(self, exchange: _Exchange) -> Generator[StreamResult]:
-        timeout = self._route.timeout_s
-        with _connected(self._route, timeout) as socket:
-            socket.send(self._conversation.opening())
-            results = exchange.take_in(self._conversation.opened, socket.recv(max(timeout, handshake.READY_S)))
-            self._route.connected()
-            with exchange.sending_over(socket):
+    def _results_of_connection(self, threads: _StreamThreads) -> Generator[StreamResult]:
+        """Yields results until the stream has finished. Raises LanestreamError if the connection fails."""
+        protocol, failover, timeout = self._protocol, self._failover, self._failover.timeout_s
+        with (
+            websocket_errors(failover.endpoint),
+            connect(**connect_options(failover.endpoint, timeout)) as socket,
+        ):
+            socket.send(protocol.start_message())
+            answer = socket.recv(max(timeout, READY_TIMEOUT_S))
+            results = threads.locked(partial(protocol.receive_ready, answer))
+            failover.connected()
+            with threads.sending_to(socket):
                 yield from results
-                while self._conversation.summary is None:
-                    results = exchange.take_in(self._conversation.incoming, socket.recv())
+                while protocol.summary is None:
+                    results = threads.locked(partial(protocol.receive, socket.recv()))
                     if results:
-                        self._route.progressed()
+                        failover.progressed()
                     yield from results
 
-    def _after(self, failure: LanestreamError, exchange: _Exchange) -> Generator[StreamResult]:
-        """Waits until it is time for another attempt. Raises `failure` where there will be none."""
-        pause = self._route.after(failure, leaving=self._conversation.is_draining)
+    def _handle_failure(self, failure: LanestreamError, threads: _StreamThreads) -> Generator[StreamResult]:
+        """Yields the results that were lost and waits for the next attempt. Raises `failure` if there is none."""
+        pause = self._failover.pause_after(failure, draining=self._protocol.is_draining)
         if pause is None:
-            yield from exchange.do(self._conversation.given_up)
+            yield from threads.locked(self._protocol.give_up)
             raise failure
-        yield from exchange.do(self._conversation.lost_connection)
-        if self._conversation.summary is None:
+        yield from threads.locked(self._protocol.connection_lost)
+        if self._protocol.summary is None:
             time.sleep(pause)
 
 
-@contextmanager
-def _connected(route: Route, timeout: float) -> Iterator[ClientConnection]:
-    endpoint = route.endpoint
-    with handshake.telling(endpoint), connect(**handshake.options(endpoint, timeout)) as socket:
-        yield socket
+class _StreamThreads:
+    """The threads of one stream, which share its protocol: one reads the source, and one per connection sends."""
 
-
-class _Exchange:
-    """Where three threads share one conversation: the source's and, for each socket, the sender's, and the caller's."""
-
-    def __init__(self, conversation: ClientProtocol, frames: Iterator[SourceFrame]) -> None:
-        self._conversation = conversation
+    def __init__(self, protocol: ClientProtocol, frames: Iterator[SourceFrame]) -> None:
+        self._protocol = protocol
         self._frames = frames
         self._changed = threading.Condition()
-        self._sends = False
+        self._sending = False
         self._stopped = False
-        self._failure: Exception | None = None
-        self._source: threading.Thread | None = None
+        self._source_error: Exception | None = None
+        self._reader: threading.Thread | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -205,78 +212,74 @@ class _Exchange:
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
-        if self._source is not None:
-            self._source.join()
+        if self._reader is not None:
+            self._reader.join()
 
-    def do(self, act: Callable[[], list[StreamResult]]) -> list[StreamResult]:
-        """Calls a method of the conversation when no other thread does."""
+    def locked(self, call: Callable[[], list[StreamResult]]) -> list[StreamResult]:
+        """Calls a method of the protocol under the lock, then wakes the other threads."""
         with self._changed:
-            results = act()
+            results = call()
             self._changed.notify_all()
         return results
 
-    def take_in(self, act: Callable[[str | bytes], list[StreamResult]], text: str | bytes) -> list[StreamResult]:
-        """Hands a message to a method of the conversation when no other thread calls one."""
-        return self.do(lambda: act(text))
-
     @contextmanager
-    def sending_over(self, socket: ClientConnection) -> Iterator[None]:
-        """Sends what there is to send, in the block. The source is read from the first block on."""
-        self._sends = True
+    def sending_to(self, socket: ClientConnection) -> Iterator[None]:
+        """Sends the protocol's messages to `socket` during the block. The first call starts to read the source."""
+        self._sending = True
         sender = threading.Thread(target=self._send, args=(socket,), name="lanestream-sender", daemon=True)
         sender.start()
-        if self._source is None:
-            self._source = threading.Thread(target=self._read, name="lanestream-source", daemon=True)
-            self._source.start()
+        if self._reader is None:
+            self._reader = threading.Thread(target=self._read_source, name="lanestream-source", daemon=True)
+            self._reader.start()
         try:
             yield
         finally:
             with self._changed:
-                self._sends = False
+                self._sending = False
                 self._changed.notify_all()
-            # A send that waits for a service that no longer reads ends with its socket.
+            # Closing the socket also ends a send that blocks because the service no longer reads.
             socket.close()
             sender.join()
 
-    def check(self) -> None:
-        """Raises what the source failed with, after all that came before it was answered."""
-        if self._failure is not None:
-            raise self._failure
+    def raise_source_error(self) -> None:
+        """Raises the exception of the source, if any. To be called after all frames before it have their results."""
+        if self._source_error is not None:
+            raise self._source_error
 
     def _send(self, socket: ClientConnection) -> None:
-        # The receiving side meets a closed connection too, and tells it.
+        # The receiving thread meets the closed connection too, and reports it.
         with suppress(ConnectionClosed):
             while messages := self._next_messages():
                 for message in messages:
                     socket.send(message)
 
     def _next_messages(self) -> list[str | bytes]:
-        """What to send next, as soon as there is something; nothing at all when the socket is to be left."""
+        """Waits for messages to send and returns them. Returns none when sending over this socket should stop."""
         with self._changed:
-            while self._sends:
-                if messages := self._conversation.outgoing():
+            while self._sending:
+                if messages := self._protocol.messages_to_send():
                     self._changed.notify_all()
                     return messages
                 self._changed.wait()
         return []
 
-    def _read(self) -> None:
+    def _read_source(self) -> None:
         try:
             for frame in self._frames:
-                if not self._offered(frame):
+                if not self._add_frame(frame):
                     return
         except Exception as error:
-            self._failure = error
+            self._source_error = error
         with self._changed:
-            self._conversation.no_more()
+            self._protocol.end_source()
             self._changed.notify_all()
 
-    def _offered(self, frame: SourceFrame) -> bool:
-        """Hands a frame over and waits until the next is wanted. False where it will never be."""
+    def _add_frame(self, frame: SourceFrame) -> bool:
+        """Adds a frame and waits until the next one is wanted. Returns False if the stream has stopped."""
         data = frame.encoded()
         with self._changed:
             if not self._stopped:
-                self._conversation.offer(frame, data)
+                self._protocol.add_frame(frame, data)
                 self._changed.notify_all()
-            self._changed.wait_for(lambda: self._stopped or self._conversation.wants_frame)
+            self._changed.wait_for(lambda: self._stopped or self._protocol.wants_frame)
             return not self._stopped

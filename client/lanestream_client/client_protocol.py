@@ -1,11 +1,11 @@
-"""The client's side of a stream, without its sockets: shared by the client that blocks and the one that awaits.
+"""The client's side of a stream without any I/O. The blocking and the async client share it.
 
-Keeps a few frames in flight, one unless told otherwise: more would wait in the service and make every answer older,
-which pays only where the network is slower than the service. None has to be dropped of a source that can wait.
+A `ClientProtocol` keeps a few frames in flight, one by default: more would only queue in the service and make every
+result older, which pays off only if the network is slower than the service.
 
-A stream outlives its sockets. Each frame of the source comes to one result, or is counted as dropped, whatever happens
-to a socket: in mode `latest` what was sent and not answered is lost with it; in mode `all` it is sent again, unless the
-session goes on and has worked on it already, because then only the answer is gone.
+A stream outlives its sockets: even if they break, each frame of the source gets exactly one result or is counted as
+dropped. After a connection was lost, mode `latest` reports the unanswered frames as lost. Mode `all` sends them again,
+except those that a resumed session has already processed: only their results are lost.
 """
 
 from __future__ import annotations
@@ -14,14 +14,10 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import Enum, auto
+from typing import Literal
 
-from lanestream.errors import (
-    DrainingError,
-    ImageTooLargeError,
-    LostError,
-    ProtocolError,
-    error_of,
-)
+from lanestream.errors import DrainingError, ImageTooLargeError, LostError, ProtocolError, error_of
 from lanestream.protocol import (
     AnyServerMessage,
     DrainingMessage,
@@ -37,64 +33,71 @@ from lanestream.protocol import (
 )
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
 
+_Unanswered = Literal["dropped", "lost"]
+
+
+class ClientState(Enum):
+    """The states of a stream on the client's side."""
+
+    DISCONNECTED = auto()  # no socket, or the service has not answered `start` yet
+    OPEN = auto()  # frames can be sent
+    ENDING = auto()  # `end` was sent; the last results and the summary are due
+    FINISHED = auto()  # the summary is known
+
 
 @dataclass(frozen=True)
-class _Pending:
-    """A frame without a result: it waits to be sent, has been sent, or was refused here."""
+class _PendingFrame:
+    """A frame without a result: waiting to be sent, sent, or rejected by the client itself."""
 
     frame: SourceFrame
     data: bytes
     sent: bool = False
-    refused: ErrorMessage | None = None
+    rejection: ErrorMessage | None = None
 
     @property
-    def waits(self) -> bool:
-        return not self.sent and self.refused is None
+    def waiting(self) -> bool:
+        return not self.sent and self.rejection is None
 
 
 class ClientProtocol:
-    """What is to be sent, was sent and is owed, with up to `in_flight` frames unanswered.
+    """Decides what to send, and matches the service's messages to frames.
 
-    None of its methods waits; calls from several threads need a lock around them. `ready` is what the service said when
-    it opened the stream last, `reconnects` how often it did so again, `summary` the count after the end.
+    At most `in_flight` frames are unanswered at a time. No method blocks. Calls from several threads need a lock.
+    `ready` is the service's latest answer to `start`, `reconnects` counts how often the stream was opened again,
+    `is_draining` says whether the service announced over the latest socket that it is about to stop, and `summary` is
+    set when the stream has finished.
     """
 
     def __init__(self, start: StartMessage, *, in_flight: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
+        self.state = ClientState.DISCONNECTED
         self.ready: ReadyMessage | None = None
         self.summary: StreamSummary | None = None
         self.reconnects = 0
+        self.is_draining = False
         self._start = start
         self._in_flight = in_flight
         self._clock = clock
-        self._began = 0.0
-        self._pending: dict[int, _Pending] = {}  # in rising order
+        self._started_at = 0.0
+        self._pending: dict[int, _PendingFrame] = {}  # by sequence number, in ascending order
         self._last_seq = -1
-        self._count: Counter[str] = Counter()
-        self._source_is_over = False
-        self._is_open = False
-        self._is_draining = False
-        self._end_was_sent = False
-
-    @property
-    def is_draining(self) -> bool:
-        """Whether the service said, over the latest socket, that it is about to stop."""
-        return self._is_draining
+        self._counts: Counter[str] = Counter()
+        self._source_ended = False
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the next frame of the source is wanted."""
-        return not any(pending.waits for pending in self._pending.values())
+        """Whether the next frame of the source should be read."""
+        return not any(pending.waiting for pending in self._pending.values())
 
-    def opening(self) -> str:
-        """The first message over a socket; it asks for the session that the socket before had."""
+    def start_message(self) -> str:
+        """Returns the first message for a new socket. It resumes the session of the previous socket, if any."""
         return self._start.model_dump_json(exclude_none=True)
 
-    def opened(self, text: str | bytes) -> list[StreamResult]:
-        """Takes the service's answer to the opening in; the results of frames whose answers are lost.
+    def receive_ready(self, text: str | bytes) -> list[StreamResult]:
+        """Handles the service's answer to `start`. Returns results for the frames whose results are lost.
 
-        Raises the error that it tells, ProtocolError where it is odd.
+        Raises the error that the service sent, or ProtocolError if the answer is not `ready`.
         """
-        ready = _parsed(text)
+        ready = _parse(text)
         if isinstance(ready, ErrorMessage):
             raise error_of(ready.code, ready.message, ready.hint)
         if isinstance(ready, DrainingMessage):
@@ -102,179 +105,183 @@ class ClientProtocol:
         if not isinstance(ready, ReadyMessage):
             raise ProtocolError(f"the service answered `start` with `{ready.type}`")
         if self.ready is None:
-            self._began = self._clock()
+            self._started_at = self._clock()
         else:
             self.reconnects += 1
         self.ready = ready
         self._start = self._start.model_copy(update={"resume_token": ready.resume_token})
-        self._is_open, self._is_draining, self._end_was_sent = True, False, False
-        worked_on = ready.last_seq if ready.resumed and ready.last_seq is not None else -1
-        results = self._settled_before(worked_on + 1, missing="lost")
-        self._pending = {seq: self._checked(replace(each, sent=False)) for seq, each in self._pending.items()}
+        self.state, self.is_draining = ClientState.OPEN, False
+        processed = ready.last_seq if ready.resumed and ready.last_seq is not None else -1
+        results = self._settle_unanswered(processed + 1, "lost")
+        self._pending = {seq: self._check_size(replace(each, sent=False)) for seq, each in self._pending.items()}
         return results
 
-    def offer(self, frame: SourceFrame, data: bytes) -> None:
-        """Takes the next frame of the source in, encoded as `data`. To be called when the stream was opened once.
+    def add_frame(self, frame: SourceFrame, data: bytes) -> None:
+        """Adds the next frame of the source, encoded as `data`. Requires that the stream was opened before.
 
-        It was wanted when the source was asked for it; meanwhile frames before it may have to be sent again.
-        Raises ProtocolError where its number is not above that of the frame before.
+        Accepts a frame although `wants_frame` is false now: since the source was asked for it, a lost connection may
+        have returned earlier frames to the queue. Raises ProtocolError if its number does not rise.
         """
         if frame.seq <= self._last_seq:
-            raise ProtocolError(f"frame {frame.seq} came after frame {self._last_seq}", "numbers of frames must rise")
+            raise ProtocolError(f"frame {frame.seq} came after frame {self._last_seq}", "frame numbers must rise")
         self._last_seq = frame.seq
-        self._pending[frame.seq] = self._checked(_Pending(frame, data))
+        self._pending[frame.seq] = self._check_size(_PendingFrame(frame, data))
 
-    def no_more(self) -> None:
-        """The source is over."""
-        self._source_is_over = True
+    def end_source(self) -> None:
+        """Records that the source has no more frames."""
+        self._source_ended = True
 
-    def outgoing(self) -> list[str | bytes]:
-        """The messages to send now: those of a frame, or the `end`; none at all until something else happens."""
-        if not self._is_open or self._is_draining:
+    def messages_to_send(self) -> list[str | bytes]:
+        """Returns the messages to send now: those of one frame, `end`, or none until something changes."""
+        if self.state is not ClientState.OPEN or self.is_draining:
             return []
-        waiting = next((pending for pending in self._pending.values() if pending.waits), None)
-        if waiting is None:
-            return self._ending()
-        if not self._has_room:
+        pending = next((pending for pending in self._pending.values() if pending.waiting), None)
+        if pending is None:
+            return self._end_messages()
+        if not self._has_credit:
             return []
-        frame = waiting.frame
-        self._pending[frame.seq] = replace(waiting, sent=True)
-        announced = FrameMessage(seq=frame.seq, timestamp=frame.timestamp)
-        return [announced.model_dump_json(exclude_none=True), waiting.data]
+        frame = pending.frame
+        self._pending[frame.seq] = replace(pending, sent=True)
+        header = FrameMessage(seq=frame.seq, timestamp=frame.timestamp)
+        return [header.model_dump_json(exclude_none=True), pending.data]
 
-    def incoming(self, text: str | bytes) -> list[StreamResult]:
-        """Takes a later message of the service in; the results that it settles, in the frames' order.
+    def receive(self, text: str | bytes) -> list[StreamResult]:
+        """Handles a message after `ready`. Returns the results that it settles, in frame order.
 
-        Raises the error that ends the stream, or that is not about a frame.
+        Raises the error that the service sent if it ends the stream or is not about a frame, and ProtocolError if the
+        message is not valid here.
         """
-        message = _parsed(text)
-        if isinstance(message, DrainingMessage):
-            self._drain(message.resume_token)
-            return []
-        if isinstance(message, SummaryMessage) and self._end_was_sent:
-            results = self._settled_before(self._last_seq + 1)
-            self._sum_up()
-            return results
+        message = _parse(text)
+        if isinstance(message, LanesMessage):
+            return self._settle(message.seq, message)
         if isinstance(message, ErrorMessage):
             if message.fatal or message.seq is None:
                 raise error_of(message.code, message.message, message.hint)
             if message.code == DrainingError.code:
-                return self._put_back(message.seq)
+                return self._return_to_queue(message.seq)
             return self._settle(message.seq, message)
-        if isinstance(message, LanesMessage):
-            return self._settle(message.seq, message)
+        if isinstance(message, DrainingMessage):
+            self._drain(message.resume_token)
+            return []
+        if isinstance(message, SummaryMessage) and self.state is ClientState.ENDING:
+            results = self._settle_unanswered(self._last_seq + 1)
+            self._finish()
+            return results
         raise ProtocolError(f"the service sent `{message.type}` in the middle of the stream")
 
-    def lost_connection(self) -> list[StreamResult]:
-        """The socket is gone; the results that this comes to. There is a summary then where nothing is left to do."""
-        self._is_open = False
-        doubtful = [seq for seq, pending in self._pending.items() if pending.sent]
-        if self._start.mode == "all" and doubtful:
-            results = self._settled_before(doubtful[0])
+    def connection_lost(self) -> list[StreamResult]:
+        """Handles the loss of the socket. Returns the results that this settles.
+
+        The stream is finished if the source has ended and every frame has its result.
+        """
+        self.state = ClientState.DISCONNECTED
+        unanswered = [seq for seq, pending in self._pending.items() if pending.sent]
+        if self._start.mode == "all" and unanswered:
+            results = self._settle_unanswered(unanswered[0])
         else:
-            results = self._settled_before(self._last_seq + 1, missing="lost")
-        if self._source_is_over and not self._pending:
-            self._sum_up()
+            results = self._settle_unanswered(self._last_seq + 1, "lost")
+        if self._source_ended and not self._pending:
+            self._finish()
         return results
 
-    def given_up(self) -> list[StreamResult]:
-        """There will be no other socket; the results of all frames that have none yet. There is a summary then."""
-        self._is_open = False
-        results = [self._given_back(seq, "lost") for seq in list(self._pending)]
-        self._sum_up()
+    def give_up(self) -> list[StreamResult]:
+        """Finishes the stream without another socket. Returns results for all frames that have none yet."""
+        results = [self._settle_one_unanswered(seq, "lost") for seq in list(self._pending)]
+        self._finish()
         return [result for result in results if result is not None]
 
     @property
-    def _has_room(self) -> bool:
+    def _has_credit(self) -> bool:
         if self.ready is None:
             return False
         window = min(self._in_flight, self.ready.limits.credits)
         return sum(pending.sent for pending in self._pending.values()) < window
 
-    def _ending(self) -> list[str | bytes]:
-        if self._end_was_sent or not self._source_is_over:
+    def _end_messages(self) -> list[str | bytes]:
+        if not self._source_ended:
             return []
-        self._end_was_sent = True
+        self.state = ClientState.ENDING
         return [EndMessage().model_dump_json()]
 
-    def _checked(self, pending: _Pending) -> _Pending:
-        """The frame, refused where it has more bytes than the service accepts, which would end the stream."""
-        if self.ready is None or pending.refused is not None:
+    def _check_size(self, pending: _PendingFrame) -> _PendingFrame:
+        """Rejects a frame with more bytes than the service accepts. To send it would end the stream."""
+        if self.ready is None or pending.rejection is not None:
             return pending
-        size, most = len(pending.data), self.ready.limits.max_bytes
-        if size <= most:
+        size, limit = len(pending.data), self.ready.limits.max_bytes
+        if size <= limit:
             return pending
-        error = ImageTooLargeError(f"the frame has {size:,} bytes; the service accepts {most:,}")
-        return replace(pending, refused=error_message(error, seq=pending.frame.seq))
+        error = ImageTooLargeError(f"the frame has {size:,} bytes; the service accepts {limit:,}")
+        return replace(pending, rejection=error_message(error, seq=pending.frame.seq))
 
-    def _drain(self, token: str | None) -> None:
-        self._is_draining = True
-        if token is not None:
-            self._start = self._start.model_copy(update={"resume_token": token})
+    def _drain(self, resume_token: str | None) -> None:
+        self.is_draining = True
+        if resume_token is not None:
+            self._start = self._start.model_copy(update={"resume_token": resume_token})
 
-    def _put_back(self, seq: int) -> list[StreamResult]:
-        """A frame came too late for a service that stops: another can do it, but only a frame that can wait waits."""
+    def _return_to_queue(self, seq: int) -> list[StreamResult]:
+        """Handles a frame that a draining service refused: mode `all` will send it again, mode `latest` loses it."""
         self._drain(None)
-        self._check_due(seq)
-        results = self._settled_before(seq)
+        self._check_sent(seq)
+        results = self._settle_unanswered(seq)
         if self._start.mode == "all":
             self._pending[seq] = replace(self._pending[seq], sent=False)
             return results
-        return [*results, *self._settled_before(seq + 1, missing="lost")]
+        return [*results, *self._settle_unanswered(seq + 1, "lost")]
 
     def _settle(self, seq: int, message: LanesMessage | ErrorMessage) -> list[StreamResult]:
-        self._check_due(seq)
-        if any(pending.waits for number, pending in self._pending.items() if number < seq):
-            raise ProtocolError(f"the service answered frame {seq} before one that it has still to be sent")
-        results = self._settled_before(seq)
+        self._check_sent(seq)
+        if any(pending.waiting for number, pending in self._pending.items() if number < seq):
+            raise ProtocolError(f"the service answered frame {seq} before an earlier frame that must be sent again")
+        results = self._settle_unanswered(seq)
         frame = self._pending.pop(seq).frame
         if isinstance(message, LanesMessage):
-            self._count["answered"] += 1
+            self._counts["answered"] += 1
             return [*results, StreamResult(frame, lanes=message)]
-        self._count["failed"] += 1
+        self._counts["failed"] += 1
         return [*results, StreamResult(frame, error=message)]
 
-    def _check_due(self, seq: int) -> None:
+    def _check_sent(self, seq: int) -> None:
         if seq not in self._pending or not self._pending[seq].sent:
             raise ProtocolError(f"the service answered frame {seq}, which was not sent")
 
-    def _settled_before(self, seq: int, missing: str | None = None) -> list[StreamResult]:
-        """The results of the frames before `seq`, up to the first that is still to be sent.
+    def _settle_unanswered(self, end: int, outcome: _Unanswered | None = None) -> list[StreamResult]:
+        """Returns the results of the frames before `end`, up to the first that is still waiting to be sent.
 
-        Answers come in order, so frames that were sent and have none are `missing`: dropped by the service in mode
-        `latest`, and lost in mode `all`, where none may be dropped, unless another word is given.
+        The service answers in order, so a frame before an answered one gets no answer any more. By default its outcome
+        is `dropped` in mode `latest`, and `lost` in mode `all`, which must not drop frames.
         """
-        missing = missing or ("dropped" if self._start.mode == "latest" else "lost")
+        outcome = outcome or ("dropped" if self._start.mode == "latest" else "lost")
         results = []
-        for number in [number for number in self._pending if number < seq]:
-            if self._pending[number].waits:
+        for seq in [seq for seq in self._pending if seq < end]:
+            if self._pending[seq].waiting:
                 break
-            results.append(self._given_back(number, missing))
+            results.append(self._settle_one_unanswered(seq, outcome))
         return [result for result in results if result is not None]
 
-    def _given_back(self, seq: int, missing: str) -> StreamResult | None:
-        """The result of a frame that no answer came for; None where it counts as dropped."""
+    def _settle_one_unanswered(self, seq: int, outcome: _Unanswered) -> StreamResult | None:
+        """Returns the result of a frame that the service did not answer, or None if it counts as dropped."""
         pending = self._pending.pop(seq)
-        self._count["failed" if pending.refused else missing] += 1
-        if pending.refused is not None:
-            return StreamResult(pending.frame, error=pending.refused)
-        if missing == "dropped":
+        self._counts["failed" if pending.rejection else outcome] += 1
+        if pending.rejection is not None:
+            return StreamResult(pending.frame, error=pending.rejection)
+        if outcome == "dropped":
             return None
-        error = LostError("the answer to this frame was lost with the connection")
+        error = LostError("the result of this frame was lost with the connection")
         return StreamResult(pending.frame, error=error_message(error, seq=seq))
 
-    def _sum_up(self) -> None:
+    def _finish(self) -> None:
+        self.state = ClientState.FINISHED
         self.summary = StreamSummary(
-            frames=self._count.total(),
-            answered=self._count["answered"],
-            failed=self._count["failed"],
-            dropped=self._count["dropped"],
-            lost=self._count["lost"],
-            duration_s=0.0 if self.ready is None else round(self._clock() - self._began, 3),
+            frames=self._counts.total(),
+            answered=self._counts["answered"],
+            failed=self._counts["failed"],
+            dropped=self._counts["dropped"],
+            lost=self._counts["lost"],
+            duration_s=0.0 if self.ready is None else round(self._clock() - self._started_at, 3),
         )
 
 
-def _parsed(text: str | bytes) -> AnyServerMessage:
+def _parse(text: str | bytes) -> AnyServerMessage:
     if isinstance(text, bytes):
-        raise ProtocolError("the service sent a binary message")
+        raise ProtocolError("the service sent a binary message; only text messages are expected")
     return parse_server_message(text)

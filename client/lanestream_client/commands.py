@@ -1,77 +1,75 @@
-"""The commands `detect` and `stream`: lanes of images and of videos, by a service or in this process.
+"""The commands `detect` and `stream`, which find lanes in images and videos, with a service or in this process.
 
-Whoever mounts them gives the way to load an engine of this process as the context's object, a `Load`.
+The program that mounts them passes the function that loads an engine of this process as the context's object, a
+`LoadEngine`. This package itself does not depend on the service.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import click
 from click.core import ParameterSource
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lanestream.errors import ImageError, LanestreamError, LostError, SourceError, needs_extra
-from lanestream.protocol import camera_of
-from lanestream.runtime import PROVIDERS
+from lanestream.errors import ImageError, LanestreamError, SourceError, needs_extra
+from lanestream.protocol import DetectorName, Mode, camera_of
 from lanestream_client.client import LaneClient
-from lanestream_client.failover import Patience
-from lanestream_client.frames import SourceFrame
-from lanestream_client.in_process import InProcess, LocalEngine
-from lanestream_client.live import NewestFrames
-from lanestream_client.report import Tally
-from lanestream_client.requests import image_bytes
-from lanestream_client.service import ServiceInfo
-from lanestream_client.sinks import json_lines, video_sink
-from lanestream_client.sources import image_files, open_source
+from lanestream_client.failover import RetryPolicy
+from lanestream_client.frames import SourceFrame, StreamResult
+from lanestream_client.in_process import InProcessClient, InProcessEngine
+from lanestream_client.requests import ServiceInfo
+from lanestream_client.sinks import RunReport, json_lines_sink, video_sink
+from lanestream_client.sources import NewestFrames, image_files, open_source
 
 if TYPE_CHECKING:
-    from lanestream.protocol import DetectorName, LanesMessage, Mode
-    from lanestream_client.frames import StreamResult
-    from lanestream_client.service import LaneService, ResultStream
-    from lanestream_client.sinks import JsonLines, VideoSink
-    from lanestream_client.sources import Source
+    from lanestream.protocol import LanesMessage
+    from lanestream_client.in_process import LaneService, ResultStream
+    from lanestream_client.sinks import ResultSink
+    from lanestream_client.sources import CameraSource
 
-Load = Callable[[Path | None, str, Path | None], LocalEngine]
+# Loads an engine from the model file, the name of the execution provider and the regressor file. Each may be None for
+# the default. Raises click.BadParameter if the provider is unknown.
+LoadEngine = Callable[[Path | None, str | None, Path | None], InProcessEngine]
 _Command = Callable[..., None]
-_INTERRUPTED = 130
+_EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 
 
-def _service_options(command: _Command) -> _Command:
+def _common_options(command: _Command) -> _Command:
     options = [
         click.option(
             "--url",
             multiple=True,
-            help="Service to ask, such as http://127.0.0.1:8000; each of its replicas  [default: work in this process]",
+            help="URL of a service, such as http://127.0.0.1:8000; repeat it for replicas  [default: run in process]",
         ),
         click.option(
             "--api-key",
             envvar="LANESTREAM_API_KEY",
             show_envvar=True,
             metavar="KEY",
-            help="What opens the service, where it asks for a key.",
+            help="API key for the service.",
         ),
-        click.option("--model", type=click.Path(path_type=Path), help="ONNX file to run in this process."),
+        click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network to run in process."),
         click.option(
             "--regressor",
             type=click.Path(path_type=Path),
             metavar="FILE|none",
-            help="ONNX file of the second network in this process, or none  [default: the shipped one]",
+            help="ONNX file of the regressor to run in process, or none  [default: the built-in one]",
         ),
         click.option(
             "--provider",
-            type=click.Choice(PROVIDERS),
-            help="What runs them in this process  [default: auto]",
+            metavar="NAME",
+            help="Execution provider in process; see `lanestream doctor --help`  [default: auto]",
         ),
         click.option(
             "--detector",
-            type=click.Choice(["candidates", "regression"]),
-            help="What finds the lanes  [default: that of the model]",
+            type=click.Choice(get_args(DetectorName)),
+            help="Detector to use  [default: the model's]",
         ),
         click.option(
             "--horizon",
@@ -82,16 +80,18 @@ def _service_options(command: _Command) -> _Command:
             "--camera-height",
             type=click.FloatRange(0.3, 4.0),
             metavar="M",
-            help="Metres up to the camera, with --field-of-view: lanes in metres too",
+            help="Height of the camera in meters; with --field-of-view, lanes are also given in meters.",
         ),
         click.option(
             "--field-of-view",
             type=click.FloatRange(20.0, 150.0),
             metavar="DEG",
-            help="Horizontal field of view of the camera in degrees",
+            help="Horizontal field of view of the camera in degrees.",
         ),
         click.option(
-            "--jsonl", type=click.Path(path_type=Path), help="Write one line of JSON a frame; - is the output."
+            "--jsonl",
+            type=click.Path(path_type=Path),
+            help="Write one line of JSON per frame to this file; - is standard output.",
         ),
     ]
     for option in reversed(options):
@@ -101,8 +101,10 @@ def _service_options(command: _Command) -> _Command:
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="PATH...")
-@_service_options
-@click.option("--annotate", type=click.Path(path_type=Path, file_okay=False), help="Folder to draw the lanes into.")
+@_common_options
+@click.option(
+    "--annotate", type=click.Path(path_type=Path, file_okay=False), help="Write images with lanes to this folder."
+)
 @click.pass_context
 def detect(
     context: click.Context,
@@ -116,49 +118,55 @@ def detect(
     annotate: Path | None,
     **where: Any,
 ) -> None:
-    """Find lanes in images: files, or folders of them. Each image stands for itself."""
-    files = _files(paths)
+    """Find lanes in images: files, or folders of them. Each image is processed on its own."""
+    files = _image_files(paths)
     camera = camera_of(camera_height, field_of_view)
-    tally = Tally()
+    report = RunReport()
     with ExitStack() as stack:
-        service = stack.enter_context(_service(context.obj, **where))
-        lanes_of = partial(service.detect, horizon=horizon, detector=detector, camera=camera)
-        lines = stack.enter_context(json_lines(jsonl))
-        advance = stack.enter_context(_progress("images", len(files)))
+        service = stack.enter_context(_open_service(context.obj, **where))
+        detect_one = partial(service.detect, horizon=horizon, detector=detector, camera=camera)
+        json_lines = stack.enter_context(json_lines_sink(jsonl))
+        advance = stack.enter_context(_progress_bar("images", len(files)))
         for path in files:
-            lanes = _detected(lanes_of, path)
+            result = _detect_file(detect_one, path)
             advance()
-            if lanes is None:
-                tally.fail()
+            if result is None or result.lanes is None:
+                report.add_failure()
                 continue
-            tally.answered(lanes)
-            if lines is None:
-                click.echo(f"{path}: {_in_words(lanes)}")
+            report.write_result(result)
+            if json_lines is None:
+                click.echo(f"{path}: {_describe(result.lanes)}")
             else:
-                lines.write(lanes, file=str(path))
+                json_lines.write_result(result)
             if annotate is not None:
-                _annotate(path, lanes, annotate)
-        click.echo(f"\n{tally.report(service.describe(detector))}", err=_is_output(jsonl))
-    context.exit(1 if tally.failed else 0)
+                _write_annotated(result.frame, result.lanes, annotate / f"{path.name}.lanes.jpg")
+        click.echo(f"\n{report.text(service.describe(detector))}", err=_is_stdout(jsonl))
+    context.exit(1 if report.failed else 0)
 
 
 @click.command()
 @click.argument("source")
-@_service_options
+@_common_options
 @click.option(
-    "--mode", type=click.Choice(["all", "latest"]), help="Every frame, or the newest  [default: all of a file]"
+    "--mode",
+    type=click.Choice(get_args(Mode)),
+    help="Process the newest frame, or all frames  [default: latest for live sources, else all]",
 )
-@click.option("--video", type=click.Path(path_type=Path), help="Draw the lanes into this MP4 file.")
+@click.option("--video", type=click.Path(path_type=Path), help="Write a video with lanes to this MP4 file.")
 @click.option(
-    "--fps", type=click.FloatRange(0.1, 1000.0), default=25.0, show_default=True, help="Rate of a folder of images."
+    "--fps",
+    type=click.FloatRange(0.1, 1000.0),
+    default=25.0,
+    show_default=True,
+    help="Frame rate of a folder of images.",
 )
 @click.option(
     "--reconnect",
     type=click.FloatRange(min=0.0),
     metavar="SECONDS",
-    help="How long a lost connection is sought; 0 is not at all  [default: 30]",
+    help="Give up after this time without a connection; 0 disables reconnecting  [default: 30]",
 )
-@click.option("--session", metavar="NAME", help="A name for the stream in the service's logs.")
+@click.option("--session", metavar="NAME", help="Name of the stream in the service's logs.")
 @click.pass_context
 def stream(
     context: click.Context,
@@ -175,169 +183,158 @@ def stream(
     session: str | None,
     **where: Any,
 ) -> None:
-    """Follow the lanes of one camera.
+    """Track the lanes in the frames of one camera.
 
     SOURCE is a video file, a folder of images, a camera number or an rtsp:// or http:// URL.
     """
-    model = camera_of(camera_height, field_of_view)
+    camera = camera_of(camera_height, field_of_view)
     if session is not None and not where["url"]:
-        raise click.UsageError("--session is for the service at --url")
+        raise click.UsageError("--session needs a service: add --url")
     with ExitStack() as stack:
-        camera = stack.enter_context(open_source(source, fps))
-        service = stack.enter_context(_service(context.obj, **where))
-        lines = stack.enter_context(json_lines(jsonl))
-        outputs = _Outputs(lines, stack.enter_context(video_sink(video, camera.fps)))
-        mode = mode or ("latest" if camera.live else "all")
-        follow = partial(service.stream, mode=mode, horizon=horizon, detector=detector, camera=model, session=session)
+        frames = stack.enter_context(open_source(source, fps))
+        service = stack.enter_context(_open_service(context.obj, **where))
+        sinks = [
+            stack.enter_context(json_lines_sink(jsonl)),
+            stack.enter_context(video_sink(video, frames.fps)),
+        ]
+        run = _StreamRun([sink for sink in sinks if sink is not None])
+        mode = mode or ("latest" if frames.live else "all")
+        start = partial(service.stream, mode=mode, horizon=horizon, detector=detector, camera=camera, session=session)
         try:
-            interrupted = _follow(follow, camera, outputs, mode)
+            interrupted = run.process(start, frames, mode)
         except LanestreamError:
-            if outputs.tally.frames:
-                click.echo(outputs.report(service, detector), err=_is_output(jsonl))
+            if run.report.frames:
+                click.echo(run.report_text(service, detector), err=_is_stdout(jsonl))
             raise
-        click.echo(outputs.report(service, detector), err=_is_output(jsonl))
-    context.exit(_INTERRUPTED if interrupted else 0)
+        click.echo(run.report_text(service, detector), err=_is_stdout(jsonl))
+    context.exit(_EXIT_INTERRUPTED if interrupted else 0)
 
 
-class _Outputs:
-    """What is done with every result of a stream."""
+class _StreamRun:
+    """One run of the command `stream`: passes results to sinks and reports lost connections."""
 
-    def __init__(self, lines: JsonLines | None, video: VideoSink | None) -> None:
-        self.tally = Tally()
-        self.dropped = 0
-        self.info: ServiceInfo | None = None
+    def __init__(self, sinks: Sequence[ResultSink]) -> None:
+        self.report = RunReport()
+        self._sinks = sinks
+        self._dropped = 0
+        self._info: ServiceInfo | None = None
         self._reconnects = 0
-        self._lines = lines
-        self._video = video
 
-    def take(self, result: StreamResult) -> None:
-        """Counts a result, and writes it to where it was asked to go."""
-        if result.lanes is not None:
-            self.tally.answered(result.lanes)
-        elif result.error is not None:
-            self.tally.fail(lost=result.error.code == LostError.code)
+    def process(self, start: Callable[..., ResultStream], source: CameraSource, mode: Mode) -> bool:
+        """Streams the source. Returns whether the user interrupted it, which is how a live stream ends."""
+        with ExitStack() as stack:
+            advance = stack.enter_context(_progress_bar("frames", source.length))
+            newest = None
+            if source.live and mode == "latest":
+                newest = stack.enter_context(NewestFrames(source.frames))
+            results = start(newest or source.frames)
+            interrupted = False
+            try:
+                with closing(iter(results)) as iterator:
+                    for result in iterator:
+                        self._check_connection(results)
+                        self._write(result)
+                        advance()
+                self._check_connection(results)
+            except KeyboardInterrupt:
+                interrupted = True
+            finally:
+                dropped = results.summary.dropped if results.summary else 0
+                self._dropped = dropped + (newest.skipped if newest else 0)
+        return interrupted
+
+    def report_text(self, service: LaneService, detector: DetectorName | None) -> str:
+        """Returns the report. Asks the service what it runs only if the stream did not say: it may be gone by now."""
+        return self.report.text(self._info or service.describe(detector), self._dropped)
+
+    def _write(self, result: StreamResult) -> None:
+        self.report.write_result(result)
+        if result.error is not None:
             click.echo(f"frame {result.frame.seq}: {result.error.message}", err=True)
-        message = result.lanes or result.error
-        if self._lines is not None and message is not None:
-            self._lines.write(message, **({"file": result.frame.name} if result.frame.name else {}))
-        if self._video is not None:
-            self._draw(result, self._video)
+        for sink in self._sinks:
+            sink.write_result(result)
 
-    def watch(self, results: ResultStream) -> None:
-        """Keeps what the stream knows of the service, and says so where its connection was lost and is back."""
+    def _check_connection(self, results: ResultStream) -> None:
+        """Notes what the service runs, and reports a connection that was lost and restored."""
         if (ready := results.ready) is None:
             return
-        self.info = ServiceInfo(ready.model, ready.provider)
+        self._info = ServiceInfo(ready.model, ready.provider)
         if results.reconnects > self._reconnects:
             self._reconnects = results.reconnects
-            how = "goes on" if ready.resumed else "begins afresh, with new track ids"
-            click.echo(f"the connection was lost and is back: session {ready.session} {how}", err=True)
-
-    def report(self, service: LaneService, detector: DetectorName | None) -> str:
-        """The closing lines; a service that has said what it runs may be gone by now."""
-        return self.tally.report(self.info or service.describe(detector), self.dropped)
-
-    def _draw(self, result: StreamResult, video: VideoSink) -> None:
-        from lanestream_client.overlays import draw_error, draw_lanes
-
-        with suppress(ImageError):  # there is nothing to draw on
-            image = result.frame.image()
-            if result.lanes is not None:
-                image = draw_lanes(image, result.lanes)
-            elif result.error is not None:
-                image = draw_error(image, result.error)
-            video.write(image, result.frame.timestamp)
-
-
-def _follow(stream: Callable[..., ResultStream], camera: Source, outputs: _Outputs, mode: Mode) -> bool:
-    """Takes the camera's frames to `outputs`. True where the user broke it off, which is how a live one ends."""
-    with ExitStack() as stack:
-        advance = stack.enter_context(_progress("frames", camera.length))
-        newest = None
-        if camera.live and mode == "latest":
-            newest = stack.enter_context(NewestFrames(camera.frames))
-        results = stream(newest or camera.frames)
-        interrupted = False
-        try:
-            with closing(iter(results)) as each:
-                for result in each:
-                    outputs.watch(results)
-                    outputs.take(result)
-                    advance()
-            outputs.watch(results)
-        except KeyboardInterrupt:
-            interrupted = True
-        finally:
-            outputs.dropped = (results.summary.dropped if results.summary else 0) + (newest.skipped if newest else 0)
-    return interrupted
+            state = "was resumed" if ready.resumed else "is new, with new track ids"
+            click.echo(f"reconnected after a lost connection: session {ready.session} {state}", err=True)
 
 
 @contextmanager
-def _service(
-    load: Load,
+def _open_service(
+    load_engine: LoadEngine,
     url: tuple[str, ...],
     api_key: str | None,
     reconnect: float | None = None,
-    **local: Any,
+    **in_process: Any,
 ) -> Iterator[LaneService]:
+    """Opens a client of the service at `url`, or loads an engine of this process if there is no URL."""
     if not url:
         key_was_given = click.get_current_context().get_parameter_source("api_key") is ParameterSource.COMMANDLINE
         if key_was_given or reconnect is not None:
-            raise click.UsageError("--api-key and --reconnect are for the service at --url")
-        yield InProcess(load(local["model"], local["provider"] or "auto", local["regressor"]))
+            raise click.UsageError("--api-key and --reconnect need a service: add --url")
+        yield InProcessClient(load_engine(in_process["model"], in_process["provider"], in_process["regressor"]))
         return
-    if any(option is not None for option in local.values()):
+    if any(option is not None for option in in_process.values()):
         raise click.UsageError(
-            "--model, --regressor and --provider are for work in this process; the service at --url has its own"
+            "--model, --regressor and --provider configure the networks of this process and can't be used with --url"
         )
-    with LaneClient(url, api_key=api_key, reconnect_s=Patience.total_s if reconnect is None else reconnect) as client:
+    reconnect_s = RetryPolicy.total_s if reconnect is None else reconnect
+    with LaneClient(url, api_key=api_key, reconnect_s=reconnect_s) as client:
         yield client
 
 
 @contextmanager
-def _progress(what: str, length: int | None) -> Iterator[Callable[[], None]]:
-    """A bar on a terminal, nothing in a pipe; what it gives is called once a step."""
+def _progress_bar(label: str, length: int | None) -> Iterator[Callable[[], None]]:
+    """Shows a progress bar if standard error is a terminal. Yields the function that advances it by one."""
     console = Console(stderr=True)
-    columns = [TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()]
+    columns = [TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()]
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task(what, total=length)
+        task = bar.add_task(label, total=length)
         yield lambda: bar.advance(task)
 
 
-def _files(paths: Sequence[Path]) -> list[Path]:
+def _image_files(paths: Sequence[Path]) -> list[Path]:
     return [file for path in paths for file in (image_files(path) if path.is_dir() else [path])]
 
 
-def _detected(lanes_of: Callable[[bytes], LanesMessage], path: Path) -> LanesMessage | None:
-    """The lanes of an image; None, with a line about why, where that image has none to give."""
+def _detect_file(detect_one: Callable[[bytes], LanesMessage], path: Path) -> StreamResult | None:
+    """Returns the result of an image file. If the file or the image is bad, prints why and returns None."""
     try:
-        return lanes_of(image_bytes(path))
+        data = path.read_bytes()
+        lanes = detect_one(data)
     except ImageError as error:
         click.echo(f"error: {path}: {error}", err=True)
-    except SourceError as error:
-        click.echo(f"error: {error}", err=True)
-    return None
+        return None
+    except OSError as error:
+        click.echo(f"error: can't read {path}: {(error.strerror or str(error)).lower()}", err=True)
+        return None
+    return StreamResult(SourceFrame(0, None, data=data, name=str(path)), lanes=lanes)
 
 
-def _in_words(lanes: LanesMessage) -> str:
+def _describe(lanes: LanesMessage) -> str:
     sides = [side for side, track in (("left", lanes.ego.left), ("right", lanes.ego.right)) if track is not None]
     ego = f"ego {' and '.join(sides)}" if sides else "no ego lane"
     count = len(lanes.lanes)
     return f"{count} {'boundary' if count == 1 else 'boundaries'}, {ego}, {lanes.timing_ms.total:.1f} ms"
 
 
-def _annotate(path: Path, lanes: LanesMessage, folder: Path) -> None:
+def _write_annotated(frame: SourceFrame, lanes: LanesMessage, target: Path) -> None:
     with needs_extra("video"):
         import cv2
 
         from lanestream_client.overlays import draw_lanes
-    target = folder / f"{path.name}.lanes.jpg"
-    picture = draw_lanes(SourceFrame(0, None, data=path.read_bytes(), name=str(path)).image(), lanes)
-    folder.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(target), picture):
+    drawn = draw_lanes(frame.image(), lanes)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(target), drawn):
         raise SourceError(f"can't write {target}")
 
 
-def _is_output(path: Path | None) -> bool:
-    """Whether the standard output carries JSON, and nothing else may be said there."""
+def _is_stdout(path: Path | None) -> bool:
+    """Returns whether JSON goes to standard output, which must then carry nothing else."""
     return str(path) == "-"

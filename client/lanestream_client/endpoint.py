@@ -1,25 +1,70 @@
-"""Where the service is, and what opens its door, told once: one URL for requests and for streams."""
+"""Where a service is, how to connect to it, and which error each failure to do so becomes.
+
+The blocking and the async client share this module. One URL serves both REST requests and streams.
+"""
 
 from __future__ import annotations
 
+import json
+import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Final
+from http.client import responses
+from typing import Any, Final
 from urllib.parse import urlsplit
 
-from lanestream.errors import SettingsError
+import httpx
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.typing import Subprotocol
 
-_WEBSOCKET_SCHEMES = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}
-_HTTP_SCHEMES = {"http": "http", "https": "https", "ws": "http", "wss": "https"}
-_KEY: Final = re.compile(r"[!-~]{1,512}")  # what a header can carry
+from lanestream.errors import (
+    ConnectionFailedError,
+    EvictedError,
+    IdleError,
+    ImageTooLargeError,
+    LanestreamError,
+    ProtocolError,
+    SettingsError,
+    TooOldError,
+    error_of,
+)
+from lanestream.protocol import SUBPROTOCOL
+
+# How long `ready` may take after a fast handshake: the service may first have to fetch the session from its store, or
+# to close the previous socket of the session.
+READY_TIMEOUT_S: Final = 5.0
+
+_WEBSOCKET_SCHEMES: Final = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}
+_HTTP_SCHEMES: Final = {"http": "http", "https": "https", "ws": "http", "wss": "https"}
+_KEY: Final = re.compile(r"[!-~]{1,512}")  # the characters that are safe in a header
+_URL_HINT: Final = "use a URL such as http://127.0.0.1:8000"
+
+# A machine that vanishes does not close its connections. Only an unanswered ping reveals the loss.
+_PING_INTERVAL_S: Final = 5.0
+_PING_TIMEOUT_S: Final = 10.0
+_CLOSE_TIMEOUT_S: Final = 1.0
+
+# The error for a close code if no message explained it. Other codes mean a lost connection. A request that was wrong
+# would be refused again, so its codes do not.
+_CLOSE_CODE_ERRORS: Final[Mapping[int, type[LanestreamError]]] = {
+    1002: ProtocolError,
+    1003: ProtocolError,
+    1007: ProtocolError,
+    1008: ProtocolError,
+    4001: EvictedError,
+    4002: IdleError,
+    4003: TooOldError,
+}
+_MESSAGE_TOO_BIG: Final = 1009
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """A replica's place: `base` for people, `http` and `stream` for requests and for the WebSocket.
+    """The address of one replica: `base` for people, `http` for requests, `stream` for WebSockets.
 
-    `headers` go with each request and each handshake. Nothing secret is in `base` or in the representation.
+    `headers` are sent with each request and each handshake. Neither `base` nor the representation holds a secret.
     """
 
     base: str
@@ -29,31 +74,101 @@ class Endpoint:
 
     @classmethod
     def parse(cls, url: str, api_key: str | None = None) -> Endpoint:
-        """The place at `url`, http, https, ws or wss, with or without a path before `/v1`. Raises SettingsError."""
-        refused = SettingsError(f"{_shown(url)!r} is no address of a service", "http://127.0.0.1:8000 would be one")
+        """Parses an http, https, ws or wss URL, with or without a path before `/v1`.
+
+        Raises SettingsError if the URL or the key is not valid.
+        """
+        invalid = SettingsError(f"{_without_login(url)!r} is not a valid service URL", _URL_HINT)
         try:
             parts = urlsplit(url if "://" in url else f"http://{url}")
-            known = parts.scheme in _HTTP_SCHEMES and bool(parts.hostname) and parts.port != 0
+            valid = parts.scheme in _HTTP_SCHEMES and bool(parts.hostname) and parts.port != 0
         except ValueError:
-            raise refused from None
-        if not known:
-            raise refused
-        path = parts.path.removesuffix("/v1/stream").rstrip("/")
-        place = f"{parts.netloc}{path}"
+            raise invalid from None
+        if not valid:
+            raise invalid
+        address = parts.netloc + parts.path.removesuffix("/v1/stream").rstrip("/")
         return cls(
-            base=_shown(url),
-            http=f"{_HTTP_SCHEMES[parts.scheme]}://{place}",
-            stream=f"{_WEBSOCKET_SCHEMES[parts.scheme]}://{place}/v1/stream",
+            base=_without_login(url),
+            http=f"{_HTTP_SCHEMES[parts.scheme]}://{address}",
+            stream=f"{_WEBSOCKET_SCHEMES[parts.scheme]}://{address}/v1/stream",
             headers=_headers(api_key),
         )
 
 
-def endpoints(url: str | Sequence[str], api_key: str | None = None) -> tuple[Endpoint, ...]:
-    """The replicas at one URL or several. Raises SettingsError where one is none, where there is none, or no key."""
+def parse_endpoints(url: str | Sequence[str], api_key: str | None = None) -> tuple[Endpoint, ...]:
+    """Parses the URL or URLs of a service's replicas. Raises SettingsError if one is not valid or none is given."""
     urls = [url] if isinstance(url, str) else url
     if not urls:
-        raise SettingsError("no address of a service was given", "http://127.0.0.1:8000 would be one")
+        raise SettingsError("no service URL was given", _URL_HINT)
     return tuple(Endpoint.parse(each, api_key) for each in urls)
+
+
+def connect_options(endpoint: Endpoint, timeout: float) -> dict[str, Any]:
+    """Returns the arguments for either of websockets' `connect` functions. `timeout` is in seconds."""
+    return {
+        "uri": endpoint.stream,
+        "subprotocols": [Subprotocol(SUBPROTOCOL)],
+        "compression": None,
+        "additional_headers": endpoint.headers,
+        "open_timeout": timeout,
+        "ping_interval": _PING_INTERVAL_S,
+        "ping_timeout": _PING_TIMEOUT_S,
+        "close_timeout": _CLOSE_TIMEOUT_S,
+        # The frames in flight bound the queue. If it could fill up, a slow caller would hold up pongs and look dead.
+        "max_queue": None,
+        "logger": _logger_without_debug(),
+    }
+
+
+@contextmanager
+def websocket_errors(endpoint: Endpoint) -> Iterator[None]:
+    """Converts websockets' exceptions in the block to LanestreamErrors."""
+    try:
+        yield
+    except ConnectionClosed as error:
+        raise closed_error(error) from None
+    except InvalidStatus as error:
+        raise refusal_error(error.response.status_code, error.response.body or b"", endpoint.base) from None
+    except (OSError, WebSocketException) as error:
+        raise _unreachable_error(endpoint.base, error) from None
+
+
+@contextmanager
+def http_errors(endpoint: Endpoint) -> Iterator[None]:
+    """Converts httpx's exceptions in the block to ConnectionFailedErrors."""
+    try:
+        yield
+    except httpx.HTTPError as error:
+        raise _unreachable_error(endpoint.base, error) from None
+
+
+def closed_error(closed: ConnectionClosed) -> LanestreamError:
+    """Returns the error for a stream whose connection ended before its summary arrived."""
+    close = closed.rcvd
+    if close is None:
+        return ConnectionFailedError("the connection to the service broke")
+    if close.code == _MESSAGE_TOO_BIG:
+        return ImageTooLargeError("a frame had more bytes than the service accepts")
+    reason = f": {close.reason}" if close.reason else ""
+    kind = _CLOSE_CODE_ERRORS.get(close.code, ConnectionFailedError)
+    return kind(f"the service closed the stream with code {close.code}{reason}")
+
+
+def refusal_error(status: int, body: bytes | bytearray, url: str) -> LanestreamError:
+    """Returns the error in an unsuccessful response, or a ConnectionFailedError if it is not from Lanestream."""
+    try:
+        problem: dict[str, Any] = json.loads(body)
+        return error_of(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
+    except (ValueError, TypeError, KeyError):
+        answer = f"{status} {responses.get(status, '')}".rstrip()
+        return ConnectionFailedError(f"{url} answered {answer}", "check that a Lanestream service runs at this URL")
+
+
+def _unreachable_error(url: str, error: Exception) -> ConnectionFailedError:
+    timed_out = isinstance(error, TimeoutError | httpx.TimeoutException)
+    reason = "the connection timed out" if timed_out else re.sub(r"^\[Errno -?\d+\] ", "", str(error))
+    reason = reason or type(error).__name__
+    return ConnectionFailedError(f"can't reach the service at {url}: {reason}", "start one with `lanestream serve`")
 
 
 def _headers(api_key: str | None) -> dict[str, str]:
@@ -61,11 +176,18 @@ def _headers(api_key: str | None) -> dict[str, str]:
         return {}
     if not _KEY.fullmatch(api_key):
         raise SettingsError(
-            "the API key can't be sent", "a key is one word of ASCII characters; look for a stray space"
+            "the API key can't be sent", "a key is 1 to 512 ASCII characters without spaces; check for a stray space"
         )
     return {"Authorization": f"Bearer {api_key}"}
 
 
-def _shown(url: str) -> str:
-    """The URL without what stands before an @, which may be a password."""
+def _without_login(url: str) -> str:
+    """Returns the URL without the user name and password before an @."""
     return re.sub(r"^([^/]*//)?[^/]*@", r"\1", url)
+
+
+def _logger_without_debug() -> logging.Logger:
+    """Returns a logger without debug messages: websockets would log headers, and so API keys, and resume tokens."""
+    logger = logging.getLogger("lanestream_client.websockets")
+    logger.setLevel(logging.INFO)
+    return logger

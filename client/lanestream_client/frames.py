@@ -1,7 +1,8 @@
-"""One frame on its way from a source to the service, and what came back for it."""
+"""A frame on its way from a source to the service, and the result that comes back for it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -12,37 +13,38 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    Image = NDArray[np.uint8]
+    BgrImage = NDArray[np.uint8]  # (H, W, 3)
 
-JPEG_QUALITY: Final = 90
+# High enough that compression artifacts do not disturb the detectors.
+_JPEG_QUALITY: Final = 90
 
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """A frame as its source has it: an image file in `data`, or decoded `pixels`, BGR (H, W, 3) uint8.
+    """A frame as its source delivers it: an image file in `data`, or decoded `pixels`, BGR (H, W, 3) uint8.
 
-    `timestamp` is the capture time in seconds on the source's clock; None leaves it to whoever receives the frame.
+    `timestamp` is the capture time in seconds on the source's clock. If it is None, the receiver assigns one.
     """
 
     seq: int
     timestamp: float | None
     data: bytes | None = None
-    pixels: Image | None = None
+    pixels: BgrImage | None = None
     name: str = ""
 
     def encoded(self) -> bytes:
-        """The frame as an image file: as it came, or as a JPEG where it came decoded."""
+        """Returns the frame as an image file: the original file, or a JPEG of `pixels`."""
         if self.data is not None:
             return self.data
         with needs_extra("video"):
             import cv2
         if self.pixels is None:
             return b""
-        _, encoded = cv2.imencode(".jpg", self.pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        _, encoded = cv2.imencode(".jpg", self.pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         return encoded.tobytes()
 
-    def image(self) -> Image:
-        """The frame's pixels, to draw on. Raises ImageError where its file can't be decoded."""
+    def image(self) -> BgrImage:
+        """Returns the frame's pixels, BGR (H, W, 3) uint8. Raises ImageError if its file can't be decoded."""
         if self.pixels is not None:
             return self.pixels
         with needs_extra("video"):
@@ -56,7 +58,7 @@ class SourceFrame:
 
 @dataclass(frozen=True)
 class StreamResult:
-    """What became of one frame: its lanes, or the error that it cost. Exactly one of the two is there."""
+    """The result of one frame: its `lanes`, or the `error` that replaced them. Exactly one of the two is set."""
 
     frame: SourceFrame
     lanes: LanesMessage | None = None
@@ -65,10 +67,11 @@ class StreamResult:
 
 @dataclass(frozen=True)
 class StreamSummary:
-    """What became of the frames of a stream, over all its connections.
+    """Counts of a stream's frames, over all its connections.
 
-    `frames` counts those that the source gave, each of them answered, failed, dropped or lost: `dropped` for a newer
-    one, `lost` with a connection. `duration_s` runs from the first `ready` on.
+    `frames` is the number of frames taken from the source, and the sum of the other four counts. `dropped` frames were
+    replaced by newer ones; the results of `lost` frames were lost with a connection. `duration_s` starts at the first
+    `ready`.
     """
 
     frames: int
@@ -77,3 +80,9 @@ class StreamSummary:
     dropped: int
     lost: int
     duration_s: float
+
+
+def as_source_frames(frames: Iterable[SourceFrame | bytes]) -> Iterator[SourceFrame]:
+    """Yields the frames of a source. Numbers plain image files from 0 and leaves their capture times unset."""
+    for seq, frame in enumerate(frames):
+        yield frame if isinstance(frame, SourceFrame) else SourceFrame(seq, None, data=frame)

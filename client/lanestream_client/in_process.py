@@ -1,4 +1,7 @@
-"""Lanes without a service: an engine of this process, handed in, behind the interface of a client."""
+"""Finds lanes without a service: wraps an engine of this process, which the caller hands in, as a client.
+
+`LaneService` is what this client and LaneClient have in common. The commands work with either.
+"""
 
 from __future__ import annotations
 
@@ -9,24 +12,68 @@ from typing import TYPE_CHECKING, Protocol
 
 from lanestream.errors import LanestreamError
 from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage, error_message
-from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
-from lanestream_client.requests import image_bytes
-from lanestream_client.service import ServiceInfo, as_frames
+from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
+from lanestream_client.requests import ServiceInfo, read_image_file
 
 if TYPE_CHECKING:
-    from lanestream_client.frames import Image
+    from lanestream_client.frames import BgrImage
 
 
-class Camera(Protocol):
-    """One camera's session with an engine."""
+class ResultStream(Protocol):
+    """The results of a stream."""
 
-    def lanes(self, image: bytes | Image, *, seq: int, timestamp: float) -> LanesMessage:
-        """The lanes of one frame, an image file or BGR pixels (H, W, 3) uint8."""
+    @property
+    def ready(self) -> ReadyMessage | None:
+        """The `ready` message of the latest connection; None before the first, and in process."""
+        ...
+
+    @property
+    def reconnects(self) -> int:
+        """How often the stream was opened again after its connection was lost."""
+        ...
+
+    @property
+    def summary(self) -> StreamSummary | None:
+        """The frame counts, or None before the end."""
+        ...
+
+    def __iter__(self) -> Generator[StreamResult]: ...
+
+
+class LaneService(Protocol):
+    """Finds lanes, in this process or elsewhere. See LaneClient for the arguments."""
+
+    def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
+        """Returns the model behind a detector and the provider that runs it; of the default detector if None."""
+        ...
+
+    def detect(
+        self,
+        image: bytes | str | Path,
+        *,
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
+    ) -> LanesMessage:
+        """Returns the lanes of one image file."""
+        ...
+
+    def stream(
+        self,
+        frames: Iterable[SourceFrame | bytes],
+        *,
+        mode: Mode = "latest",
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
+        session: str | None = None,
+    ) -> ResultStream:
+        """Returns the results of one camera's frames."""
         ...
 
 
-class Network(Protocol):
-    """A network of this process."""
+class InProcessNetwork(Protocol):
+    """A network of the engine."""
 
     @property
     def name(self) -> str:
@@ -35,32 +82,43 @@ class Network(Protocol):
 
     @property
     def provider(self) -> str:
-        """The execution provider that really runs it."""
+        """The execution provider that runs it."""
         ...
 
 
-class LocalEngine(Protocol):
-    """An engine of this process."""
+class InProcessSession(Protocol):
+    """One camera's session with the engine."""
 
-    def network(self, detector: DetectorName | None = None) -> Network:
-        """The network of a detector, of the default one where None."""
+    def lanes(self, image: bytes | BgrImage, *, seq: int, timestamp: float) -> LanesMessage:
+        """Returns the lanes of one frame, an image file or BGR pixels (H, W, 3) uint8."""
+        ...
+
+
+class InProcessEngine(Protocol):
+    """What this module needs of an engine."""
+
+    def network(self, detector: DetectorName | None = None) -> InProcessNetwork:
+        """Returns the network of a detector; of the default detector if None. Raises NoDetectorError."""
         ...
 
     def open_camera(
         self, horizon: float | None = None, detector: DetectorName | None = None, camera: CameraModel | None = None
-    ) -> Camera:
-        """A session for one camera."""
+    ) -> InProcessSession:
+        """Opens a session for one camera. Raises NoDetectorError."""
         ...
 
 
-class InProcess:
-    """What LaneClient offers, by an engine of this process."""
+class InProcessClient:
+    """A LaneService on an engine of this process."""
 
-    def __init__(self, engine: LocalEngine) -> None:
+    def __init__(self, engine: InProcessEngine) -> None:
         self._engine = engine
 
     def describe(self, detector: DetectorName | None = None) -> ServiceInfo:
-        """The model of a detector, of the default one where None, and what runs it. Raises NoDetectorError."""
+        """Returns the model behind a detector and the provider that runs it; of the default detector if None.
+
+        Raises NoDetectorError if the detector is not loaded.
+        """
         network = self._engine.network(detector)
         return ServiceInfo(network.name, network.provider)
 
@@ -72,8 +130,9 @@ class InProcess:
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
     ) -> LanesMessage:
-        """The lanes of one image file. Raises ImageError, SourceError and NoDetectorError."""
-        return self._engine.open_camera(horizon, detector, camera).lanes(image_bytes(image), seq=0, timestamp=0.0)
+        """Returns the lanes of one image file. Raises ImageError, SourceError and NoDetectorError."""
+        session = self._engine.open_camera(horizon, detector, camera)
+        return session.lanes(read_image_file(image), seq=0, timestamp=0.0)
 
     def stream(
         self,
@@ -84,28 +143,28 @@ class InProcess:
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         session: str | None = None,
-    ) -> LocalStream:
-        """The lanes of the frames of one camera. In either mode a frame is taken when the one before is done.
+    ) -> InProcessStream:
+        """Returns the results of one camera's frames. In either mode a frame is read when the previous one is done.
 
-        Raises NoDetectorError where `detector` is not loaded.
+        Raises NoDetectorError if the detector is not loaded.
         """
-        del mode, session  # nothing waits here that a newer frame could replace, and no log tells streams apart
-        return LocalStream(self._engine.open_camera(horizon, detector, camera), as_frames(frames))
+        del mode, session  # no frame waits here that a newer one could replace, and there is no log of streams
+        return InProcessStream(self._engine.open_camera(horizon, detector, camera), as_source_frames(frames))
 
 
-class LocalStream:
-    """The results of one stream, to be iterated over once; `summary` is there afterwards.
+class InProcessStream:
+    """The results of one stream, to be iterated over once. `summary` is set afterwards.
 
-    No service had to be `ready`, and no connection is ever lost.
+    There is no connection, so `ready` stays None and `reconnects` stays 0.
     """
 
     ready: ReadyMessage | None = None
     reconnects: int = 0
 
     def __init__(
-        self, camera: Camera, frames: Iterator[SourceFrame], clock: Callable[[], float] = time.monotonic
+        self, session: InProcessSession, frames: Iterator[SourceFrame], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._camera = camera
+        self._session = session
         self._frames = frames
         self._clock = clock
         self.summary: StreamSummary | None = None
@@ -117,7 +176,7 @@ class LocalStream:
             timestamp = self._clock() - started if frame.timestamp is None else frame.timestamp
             image = frame.encoded() if frame.pixels is None else frame.pixels
             try:
-                lanes = self._camera.lanes(image, seq=frame.seq, timestamp=timestamp)
+                lanes = self._session.lanes(image, seq=frame.seq, timestamp=timestamp)
             except LanestreamError as error:
                 failed += 1
                 yield StreamResult(frame, error=error_message(error, seq=frame.seq))

@@ -1,98 +1,131 @@
-"""Where results go: lines of JSON, and video files."""
+"""Where the results of a command go: lines of JSON, video files, and the report at the end.
+
+To add a sink, write a class with the method of `ResultSink` here and add its option in commands.py.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TextIO, cast
+from typing import TYPE_CHECKING, Final, Protocol, TextIO, cast
 
-from lanestream.errors import SourceError, needs_extra
+from lanestream.errors import ImageError, LostError, SourceError, needs_extra
+from lanestream.protocol import TimingModel
 
 if TYPE_CHECKING:
     import av
-    from pydantic import BaseModel
 
-    from lanestream_client.frames import Image
+    from lanestream.protocol import LanesMessage
+    from lanestream_client.frames import BgrImage, StreamResult
+    from lanestream_client.requests import ServiceInfo
 
-# Divides the frame times of 24, 25, 29.97, 30, 50 and 60 fps, and fits MPEG-4's 16 bits.
+# The frame times of 24, 25, 29.97, 30, 50 and 60 fps are multiples of it, and it fits into MPEG-4's 16 bits.
 _TIME_BASE: Final = Fraction(1, 60000)
 
 
-class JsonLines:
-    """Writes one message a line."""
+class ResultSink(Protocol):
+    """Takes the results of a run, one by one."""
+
+    def write_result(self, result: StreamResult) -> None:
+        """Writes one result."""
+        ...
+
+
+class JsonLinesSink:
+    """Writes one message per line, in front of it the field `file` if the frame has a file name."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
 
-    def write(self, message: BaseModel, **more: str) -> None:
-        """Writes `message`, with the fields `more` in front."""
-        self._file.write(json.dumps({**more, **message.model_dump(mode="json")}) + "\n")
+    def write_result(self, result: StreamResult) -> None:
+        """Writes the frame's lanes or its error."""
+        message = result.lanes or result.error
+        if message is not None:
+            name = {"file": result.frame.name} if result.frame.name else {}
+            self._file.write(json.dumps({**name, **message.model_dump(mode="json")}) + "\n")
 
 
 @contextmanager
-def json_lines(path: Path | None) -> Iterator[JsonLines | None]:
-    """A writer to the file at `path`, to the standard output where that is `-`; None where there is no path.
+def json_lines_sink(path: Path | None) -> Iterator[JsonLinesSink | None]:
+    """Opens a sink to the file at `path`, or to standard output if it is `-`. Yields None if `path` is None.
 
-    Raises SourceError where it can't be written.
+    Raises SourceError if the file can't be written.
     """
     if path is None:
         yield None
     elif str(path) == "-":
-        yield JsonLines(sys.stdout)
+        yield JsonLinesSink(sys.stdout)
     else:
-        with _writing(path), path.open("w", encoding="utf-8") as file:
-            yield JsonLines(file)
+        with _writing_to(path), path.open("w", encoding="utf-8") as file:
+            yield JsonLinesSink(file)
 
 
 class VideoSink:
-    """Writes images to an MP4 file: H.264 where there is an encoder for it, else MPEG-4.
+    """Writes images to an MP4 file, as H.264 if an encoder is available and as MPEG-4 otherwise.
 
-    The first image sets the size; later ones of another size are fitted into it.
+    The first image sets the size. Later images of another size are scaled to fit.
     """
 
     def __init__(self, container: av.container.OutputContainer, fps: float) -> None:
         self._container = container
-        self._step = round(1 / (fps * _TIME_BASE)) if fps > 0 else 1
+        self._ticks_per_frame = round(1 / (fps * _TIME_BASE)) if fps > 0 else 1
         self._stream: av.VideoStream | None = None
-        self._origin = 0.0
-        self._last = -1
+        self._first_timestamp = 0.0
+        self._last_ticks = -1
 
-    def write(self, image: Image, timestamp: float | None) -> None:
+    def write_result(self, result: StreamResult) -> None:
+        """Draws the lanes or the error on the frame and writes it. Skips a frame that can't be decoded."""
+        from lanestream_client.overlays import draw_error, draw_lanes
+
+        with suppress(ImageError):
+            image = result.frame.image()
+            if result.lanes is not None:
+                image = draw_lanes(image, result.lanes)
+            elif result.error is not None:
+                image = draw_error(image, result.error)
+            self.write(image, result.frame.timestamp)
+
+    def write(self, image: BgrImage, timestamp: float | None) -> None:
         """Adds a BGR image (H, W, 3) uint8 at `timestamp` seconds.
 
-        Where the time is unknown, or not after that of the image before, it follows that at the frame rate.
+        If the timestamp is None or does not rise, the image follows the previous one at the frame rate.
         """
         import av
 
         if self._stream is None:
-            self._stream = _video_stream(self._container, image)
-            self._origin = timestamp or 0.0
+            self._stream = _add_video_stream(self._container, image)
+            self._first_timestamp = timestamp or 0.0
         stream = self._stream
-        ticks = -1 if timestamp is None else round((timestamp - self._origin) / _TIME_BASE)
-        self._last = ticks if ticks > self._last else self._last + self._step
-        frame = av.VideoFrame.from_ndarray(_fitted(image, stream.width, stream.height), format="bgr24")
-        frame.pts, frame.time_base = self._last, _TIME_BASE
+        ticks = -1 if timestamp is None else round((timestamp - self._first_timestamp) / _TIME_BASE)
+        self._last_ticks = ticks if ticks > self._last_ticks else self._last_ticks + self._ticks_per_frame
+        frame = av.VideoFrame.from_ndarray(_resize_to_fit(image, stream.width, stream.height), format="bgr24")
+        frame.pts, frame.time_base = self._last_ticks, _TIME_BASE
         self._container.mux(stream.encode(frame))
 
     def finish(self) -> None:
-        """Writes what the encoder still holds."""
+        """Writes the frames that the encoder still holds."""
         if self._stream is not None:
             self._container.mux(self._stream.encode(None))
 
 
 @contextmanager
 def video_sink(path: Path | None, fps: float) -> Iterator[VideoSink | None]:
-    """A writer to the MP4 file at `path`; None where there is no path. Raises SourceError where it can't be written."""
+    """Opens a sink to the MP4 file at `path`. Yields None if `path` is None.
+
+    Raises SourceError if the file can't be written.
+    """
     if path is None:
         yield None
         return
     with needs_extra("video"):
         import av
-    with _writing(path), av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+    with _writing_to(path), av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         sink = VideoSink(container, fps)
         try:
             yield sink
@@ -100,8 +133,67 @@ def video_sink(path: Path | None, fps: float) -> Iterator[VideoSink | None]:
             sink.finish()
 
 
+class RunReport:
+    """Counts and times the results of a run, and describes them at its end. The run starts when it is created."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._timings: list[TimingModel] = []
+        self._with_both_ego_boundaries = 0
+        self.failed = 0
+        self.lost = 0
+
+    @property
+    def frames(self) -> int:
+        """The number of frames with a result, lanes or an error."""
+        return len(self._timings) + self.failed + self.lost
+
+    def write_result(self, result: StreamResult) -> None:
+        """Counts one result."""
+        if result.lanes is not None:
+            self.add_lanes(result.lanes)
+        elif result.error is not None and result.error.code == LostError.code:
+            self.lost += 1
+        else:
+            self.add_failure()
+
+    def add_lanes(self, lanes: LanesMessage) -> None:
+        """Counts a frame that got lanes."""
+        self._timings.append(lanes.timing_ms)
+        self._with_both_ego_boundaries += lanes.ego.left is not None and lanes.ego.right is not None
+
+    def add_failure(self) -> None:
+        """Counts a frame that failed."""
+        self.failed += 1
+
+    def text(self, info: ServiceInfo, dropped: int = 0) -> str:
+        """Returns the report. `dropped` is the number of frames without any result."""
+        answered = len(self._timings)
+        rate = answered / max(time.monotonic() - self._started, 1e-9)
+        lost = f", {self.lost} lost" if self.lost else ""
+        lines = [
+            f"{self.frames + dropped} frames: "
+            f"{answered} answered, {dropped} dropped, {self.failed} failed{lost}; {rate:.1f} frames/s"
+        ]
+        if answered:
+            share = 100.0 * self._with_both_ego_boundaries / answered
+            lines += [f"both ego boundaries in {share:.1f} % of the answered frames", ""]
+            lines += [f"{'ms':<8}{'p50':>9}{'p95':>9}", *(self._stage(stage) for stage in TimingModel.model_fields), ""]
+        lines.append(f"model {info.model} on {info.provider}")
+        return "\n".join(lines)
+
+    def _stage(self, stage: str) -> str:
+        values = sorted(getattr(timing, stage) for timing in self._timings)
+        return f"{stage:<8}{nearest_rank(values, 50):>9.2f}{nearest_rank(values, 95):>9.2f}"
+
+
+def nearest_rank(ordered: Sequence[float], percent: float) -> float:
+    """Returns the nearest-rank percentile of values in ascending order."""
+    return ordered[max(0, math.ceil(percent / 100.0 * len(ordered)) - 1)]
+
+
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def _writing_to(path: Path) -> Iterator[None]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
@@ -111,14 +203,14 @@ def _writing(path: Path) -> Iterator[None]:
         raise SourceError(f"can't write {path}: {(error.strerror or str(error)).lower()}") from None
 
 
-def _video_stream(container: av.container.OutputContainer, image: Image) -> av.VideoStream:
+def _add_video_stream(container: av.container.OutputContainer, image: BgrImage) -> av.VideoStream:
     import av
 
     height, width = image.shape[:2]
     name = "libx264" if "libx264" in av.codecs_available else "mpeg4"
     options = {"crf": "20", "preset": "veryfast"} if name == "libx264" else {}
     stream = cast("av.VideoStream", container.add_stream(name, options=options))
-    # Half the colour resolution in both directions, which is what players expect, wants even sizes.
+    # Players expect yuv420p, which halves the color resolution in both directions and so needs an even size.
     stream.width, stream.height = width + width % 2, height + height % 2
     stream.pix_fmt = "yuv420p"
     stream.time_base = stream.codec_context.time_base = _TIME_BASE
@@ -127,8 +219,8 @@ def _video_stream(container: av.container.OutputContainer, image: Image) -> av.V
     return stream
 
 
-def _fitted(image: Image, width: int, height: int) -> Image:
-    """The image scaled to fit, where its size is another, and its edges repeated to fill `width` x `height`."""
+def _resize_to_fit(image: BgrImage, width: int, height: int) -> BgrImage:
+    """Scales the image to fit into `width` x `height` if necessary, and repeats its edges to fill the rest."""
     import cv2
     import numpy as np
 

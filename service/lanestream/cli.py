@@ -1,14 +1,18 @@
-"""The command `lanestream`: serves, and mounts the commands of the client and of the exporter when they are called."""
+"""The command `lanestream`: runs the service, and mounts the commands of the client and of the exporter.
+
+The service must not import the packages above it. They announce their commands by entry points in pyproject.toml.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,106 +25,111 @@ from lanestream.runtime import PROVIDERS
 
 if TYPE_CHECKING:
     from lanestream.local import LocalEngine
-    from lanestream.runtime import Provider
 
-_FAILED: Final = 1
-_INTERRUPTED: Final = 130
-_TERMINATED: Final = 143
-_FIRST_PROCESS: Final = 1
+# Exit codes; the last two are 128 plus the number of the signal, as shells report it.
+_EXIT_FAILED: Final = 1
+_EXIT_INTERRUPTED: Final = 130
+_EXIT_TERMINATED: Final = 143
+
+# Each entry point of this group is a mapping from a command's name to the fields of a MountedCommand.
+_COMMANDS_GROUP: Final = "lanestream.commands"
+# An entry point of this group is a function that draws a `lanes` message on an image.
+_OVERLAYS_GROUP: Final = "lanestream.overlays"
 
 
 @dataclass(frozen=True)
-class Mount:
-    """A command of another package: where it is, the extra that its imports need, its line in the help."""
+class MountedCommand:
+    """A command that is imported when it is called: its `target` is "module:function".
 
-    module: str
-    name: str
+    `extra` names the optional packages that it imports, as in `pip install 'lanestream[EXTRA]'`.
+    """
+
+    target: str
     extra: str
     help: str
 
-
-_CLIENT: Final = "lanestream_client.commands"
-_DATA: Final = "lanestream_exporter.data_commands"
-_SCENES: Final = "lanestream_exporter.scene_commands"
-_TRAINING: Final = "lanestream_exporter.training_commands"
-_EXPORT: Final = "lanestream_exporter.export_commands"
-_EVALUATION: Final = "lanestream_exporter.evaluation_commands"
-_MOUNTS: Final[Mapping[str, Mount]] = {
-    "detect": Mount(_CLIENT, "detect", "video", "Find lanes in images."),
-    "stream": Mount(_CLIENT, "stream", "video", "Follow the lanes of one camera."),
-    "doctor": Mount("lanestream.doctor", "doctor", "service,cpu", "Tell what networks run on here."),
-    "scene": Mount(_SCENES, "scene", "video", "Render a clip of a road, with exact labels."),
-    "data": Mount(_DATA, "data", "export", "Look after labelled frames."),
-    "train": Mount(_TRAINING, "train", "train,service,cpu", "Train a network."),
-    "export": Mount(_EXPORT, "export", "export,service,cpu", "Turn a checkpoint into a model file."),
-    "evaluate": Mount(_EVALUATION, "evaluate", "export,service,cpu", "Measure a model's accuracy."),
-    "score": Mount(_EVALUATION, "score", "export,service,cpu", "Measure a stream's results against labels."),
-}
-
-
-class MountingGroup(click.Group):
-    """A group that imports a mounted command only when it is called, so that help needs no extra."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """All names, own and mounted."""
-        return sorted({*super().list_commands(ctx), *_MOUNTS})
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of that name. Raises MissingExtraError where its packages are not installed."""
-        mount = _MOUNTS.get(cmd_name)
-        if mount is None:
-            return super().get_command(ctx, cmd_name)
-        with needs_extra(mount.extra):
-            command: click.Command = getattr(import_module(mount.module), mount.name)
+    def load(self) -> click.Command:
+        """Imports the command. Raises MissingExtraError if its packages are not installed."""
+        module, _, name = self.target.partition(":")
+        with needs_extra(self.extra):
+            command: click.Command = getattr(import_module(module), name)
         return command
 
+
+_DOCTOR: Final = MountedCommand(
+    "lanestream.doctor:doctor", "service,cpu", "Report which execution providers work here, and how fast."
+)
+
+
+class CommandGroup(click.Group):
+    """A group that lists mounted commands without importing them, so that help needs no extra."""
+
+    @cached_property
+    def mounted(self) -> Mapping[str, MountedCommand]:
+        """The mounted commands by name."""
+        commands = {"doctor": _DOCTOR}
+        for entry_point in entry_points(group=_COMMANDS_GROUP):
+            commands |= {name: MountedCommand(**fields) for name, fields in entry_point.load().items()}
+        return commands
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Returns the names of all commands, own and mounted."""
+        return sorted({*super().list_commands(ctx), *self.mounted})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Returns the command of that name, or None. Raises MissingExtraError if its packages are not installed."""
+        mounted = self.mounted.get(cmd_name)
+        return super().get_command(ctx, cmd_name) if mounted is None else mounted.load()
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Lists the commands, the mounted ones by what is known here."""
-        lines = []
-        for name in self.list_commands(ctx):
-            own = None if name in _MOUNTS else super().get_command(ctx, name)
-            lines.append((name, own.get_short_help_str(90) if own else _MOUNTS[name].help))
+        """Writes the list of commands for the help."""
+        lines = {name: mounted.help for name, mounted in self.mounted.items()}
+        for name in super().list_commands(ctx):
+            lines[name] = self.commands[name].get_short_help_str(90)
         with formatter.section("Commands"):
-            formatter.write_dl(lines)
+            formatter.write_dl(sorted(lines.items()))
 
 
-@click.group(cls=MountingGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, message="lanestream %(version)s")
 @click.pass_context
 def cli(context: click.Context) -> None:
     """Camera frames in, tracked lane lines out."""
-    context.obj = _load_local
+    context.obj = _load_local_engine
 
 
 @cli.command()
 @click.option("--config", type=click.Path(path_type=Path), help="TOML file with settings.")
 @click.option("--host", help="Address to listen on  [default: 127.0.0.1]")
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]")
-@click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
+@click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the built-in one]")
 @click.option(
     "--regressor",
     type=click.Path(path_type=Path),
     metavar="FILE|none",
-    help="ONNX file of the second network, or none  [default: the shipped one]",
+    help="ONNX file of the regressor, or none  [default: the built-in one]",
 )
-@click.option("--provider", type=click.Choice(PROVIDERS), help="Where the networks run  [default: auto]")
-@click.option("--max-sessions", type=click.IntRange(1), help="Streams at a time at most  [default: 64]")
-@click.option("--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 a line.")
-@click.option("--log-format", type=click.Choice(["text", "json"]), help="Form of the log  [default: text]")
-@click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), help="[default: info]")
-@click.option("--print-config", is_flag=True, help="Print all settings, secrets masked, and end.")
-def serve(*, print_config: bool, **given: Any) -> None:
+@click.option("--provider", type=click.Choice(PROVIDERS), help="Execution provider  [default: auto]")
+@click.option("--max-sessions", type=click.IntRange(1), help="Maximum number of concurrent streams  [default: 64]")
+@click.option("--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 per line.")
+@click.option("--log-format", type=click.Choice(["text", "json"]), help="Log format  [default: text]")
+@click.option(
+    "--log-level", type=click.Choice(["debug", "info", "warning", "error"]), help="Log level  [default: info]"
+)
+@click.option("--print-config", is_flag=True, help="Print all settings with secrets masked, and exit.")
+def serve(*, print_config: bool, **options: Any) -> None:
     """Serve lanes over HTTP and WebSockets.
 
-    Everything can also be set by LANESTREAM_<NAME>, or in the file of --config; --print-config prints all there is.
+    Every setting can also be given as LANESTREAM_<NAME>, or in the file of --config. --print-config lists them all.
     """
     with needs_extra("service,cpu"):
-        # The image module comes first, because OpenCV reads its limit once.
         from lanestream.api.server import serve as run
         from lanestream.engine import load_engine, resolve_regressor
         from lanestream.settings import load_settings, shown
-        from lanestream_client.overlays import draw_lanes
-    settings = load_settings(**given)
+
+        # Last: OpenCV reads its pixel limit when it is first imported, and the service's modules set that limit before.
+        draw_lanes = _load_overlay()
+    settings = load_settings(**options)
     if print_config:
         click.echo(shown(settings))
         return
@@ -132,52 +141,68 @@ def serve(*, print_config: bool, **given: Any) -> None:
 @cli.command()
 @click.argument("name")
 def key(name: str) -> None:
-    """Make an API key for the caller NAME.
+    """Create an API key for the caller NAME.
 
-    The service is told its hash alone: the key itself is printed once, and kept nowhere.
+    The service needs only the hash of the key. The key itself is printed once and not stored.
     """
-    token, made = new_key(name)
+    token, setting = new_key(name)
     click.echo(f"key:      {token}")
-    click.echo(f"setting:  {made}")
-    click.echo("The caller gets the key. The setting goes to LANESTREAM_API_KEYS, or to the keys file.", err=True)
+    click.echo(f"setting:  {setting}")
+    click.echo("Give the key to the caller. Add the setting to LANESTREAM_API_KEYS or to the keys file.", err=True)
 
 
 def main() -> None:
-    """Runs the command line. Errors that are raised on purpose are told in one line."""
-    # What OpenCV would warn of on the side is said by the errors; it reads this once, when it is first imported.
+    """Runs the command line. Prints a LanestreamError in one line and exits."""
+    # OpenCV's warnings only repeat what the errors say. It reads this variable once, when it is first imported.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    if os.getpid() == _FIRST_PROCESS:
-        signal.signal(signal.SIGTERM, _end)
+    if os.getpid() == 1:
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         code = cli.main(standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Whoever read the output has had enough; the interpreter must not try to flush the rest.
+        # The reader of the output has closed it; the interpreter must not try to flush the rest at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = _FAILED
+        code = _EXIT_FAILED
     except LanestreamError as error:
         click.echo(f"error: {error}", err=True)
-        code = _FAILED
+        code = _EXIT_FAILED
     except click.ClickException as error:
         error.show()
         code = error.exit_code
     except click.Abort:
-        code = _INTERRUPTED
+        code = _EXIT_INTERRUPTED
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _end(*_: object) -> None:
-    """Does what SIGTERM does by itself, except to the first process of a container: that one would be deaf to it.
+def _terminate(*_: object) -> None:
+    """Ends the process on SIGTERM, which the kernel ignores by default for the first process of a container.
 
-    While it serves, uvicorn's handler stands in the place of this one.
+    While the service runs, uvicorn's handler replaces this one.
     """
-    os._exit(_TERMINATED)
+    os._exit(_EXIT_TERMINATED)
 
 
-def _load_local(model: Path | None, provider: Provider, regressor: Path | None) -> LocalEngine:
+def _load_local_engine(model: Path | None, provider: str | None, regressor: Path | None) -> LocalEngine:
+    """Loads an engine for the commands that work in this process; see LoadEngine in the client."""
+    chosen = next((known for known in PROVIDERS if known == (provider or "auto")), None)
+    if chosen is None:
+        raise click.BadParameter(
+            f"{provider!r} is not one of {', '.join(PROVIDERS)}.",
+            ctx=click.get_current_context(),
+            param_hint="'--provider'",
+        )
     with needs_extra("service,cpu"):
         from lanestream.local import LocalEngine
-    return LocalEngine.load(model, provider, regressor)
+    return LocalEngine.load(model, chosen, regressor)
+
+
+def _load_overlay() -> Callable[..., Any] | None:
+    """Returns the installed function that draws lanes on an image, or None if there is none."""
+    for entry_point in entry_points(group=_OVERLAYS_GROUP):
+        draw: Callable[..., Any] = entry_point.load()
+        return draw
+    return None
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Lanes in metres over real sockets, from every way in. The road of the fakes is straight and its lane is centred."""
+"""Lanes in meters through each interface of the service. The fake road is straight and the camera is centered."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from lanestream import cli
 from lanestream.local import LocalEngine
 from lanestream.protocol import LanesMessage
 from lanestream_client import AsyncLaneClient, CameraModel, LaneClient
-from lanestream_client.in_process import InProcess
+from lanestream_client.in_process import InProcessClient
 
 CAMERA = CameraModel(height=1.4, field_of_view=62.0)
 OPTIONS = ["--camera-height", "1.4", "--field-of-view", "62"]
 
 
-def check_metres(lanes: LanesMessage | dict[str, Any] | None) -> None:
-    """The boundaries of the fakes lean 1.15 columns a row: they are 1.15 camera heights to either side."""
+def check_meters(lanes: LanesMessage | dict[str, Any] | None) -> None:
+    """Checks the fake boundaries: 1.15 columns per row in the image, so 1.15 camera heights to each side."""
     assert lanes is not None
-    told = lanes if isinstance(lanes, LanesMessage) else LanesMessage.model_validate(lanes)
-    left, right = (lane.ground for lane in told.lanes)
+    message = lanes if isinstance(lanes, LanesMessage) else LanesMessage.model_validate(lanes)
+    left, right = (lane.ground for lane in message.lanes)
     assert left == pytest.approx((0.0, 0.0, 1.61), abs=1e-3)
     assert right == pytest.approx((0.0, 0.0, -1.61), abs=1e-3)
-    ego = told.ego
+    ego = message.ego
     assert ego.offset_m is not None
     assert (ego.offset_m, ego.lane_width_m) == pytest.approx((0.0, 3.22), abs=2e-3)
     assert (ego.heading, ego.curvature) == pytest.approx((0.0, 0.0), abs=1e-4)
@@ -39,34 +39,34 @@ def detect(url: str, **query: object) -> httpx.Response:
     return httpx.post(f"{url}/v1/detect", content=fakes.image_file(), params=query)
 
 
-def test_a_stream_with_a_camera_is_told_in_metres(url: str) -> None:
+def test_a_stream_with_a_camera_has_lanes_in_meters(url: str) -> None:
     with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
 
-        def heard() -> dict[str, Any]:
+        def receive() -> dict[str, Any]:
             message: dict[str, Any] = json.loads(socket.recv(fakes.WAIT_S))
             return message
 
         socket.send(json.dumps({"type": "start", "camera": {"height": 14, "field_of_view": 62}}))
-        refused = heard()
+        refused = receive()
         assert (refused["code"], refused["fatal"]) == ("bad_message", False)
         assert "camera.height" in refused["message"]
         assert "\n" not in refused["message"]
         socket.send(json.dumps({"type": "start", "mode": "all", "camera": {"height": 1.4, "field_of_view": 62}}))
-        assert heard()["type"] == "ready"
+        assert receive()["type"] == "ready"
         for _ in range(2):
             socket.send(fakes.image_file())
-            check_metres(heard())
+            check_meters(receive())
 
 
-def test_a_single_image_with_a_camera_is_told_in_metres(url: str) -> None:
-    check_metres(detect(url, camera_height=1.4, field_of_view=62).json())
-    plain = detect(url).json()
-    assert [lane["ground"] for lane in plain["lanes"]] == [None, None]
-    assert [plain["ego"][name] for name in ("offset_m", "lane_width_m", "heading", "curvature")] == [None] * 4
+def test_a_single_image_with_a_camera_has_lanes_in_meters(url: str) -> None:
+    check_meters(detect(url, camera_height=1.4, field_of_view=62).json())
+    without = detect(url).json()
+    assert [lane["ground"] for lane in without["lanes"]] == [None, None]
+    assert [without["ego"][name] for name in ("offset_m", "lane_width_m", "heading", "curvature")] == [None] * 4
 
 
 @pytest.mark.parametrize("query", [{"camera_height": 1.4}, {"field_of_view": 62}])
-def test_half_a_camera_is_refused(url: str, query: dict[str, float]) -> None:
+def test_an_incomplete_camera_is_refused(url: str, query: dict[str, float]) -> None:
     response = detect(url, **query)
     assert (response.status_code, response.json()["code"]) == (422, "bad_message")
     missing = "height" if "field_of_view" in query else "field_of_view"
@@ -75,17 +75,17 @@ def test_half_a_camera_is_refused(url: str, query: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("height", "angle", "where"),
+    ("height", "field_of_view", "parameter"),
     [("0.2", "62", "camera_height"), ("nan", "62", "camera_height"), ("1.4", "180", "field_of_view")],
 )
-def test_a_bad_camera_is_refused(url: str, height: str, angle: str, where: str) -> None:
-    response = detect(url, camera_height=height, field_of_view=angle)
+def test_an_invalid_camera_is_refused(url: str, height: str, field_of_view: str, parameter: str) -> None:
+    response = detect(url, camera_height=height, field_of_view=field_of_view)
     assert (response.status_code, response.json()["code"]) == (422, "bad_message")
-    assert where in response.json()["message"]
+    assert parameter in response.json()["message"]
     assert "\n" not in response.json()["message"]
 
 
-def test_the_documentation_has_it(url: str) -> None:
+def test_openapi_documents_the_camera_parameters(url: str) -> None:
     parameters = httpx.get(f"{url}/openapi.json").json()["paths"]["/v1/detect"]["post"]["parameters"]
     (height,) = (parameter for parameter in parameters if parameter["name"] == "camera_height")
     assert not height["required"]
@@ -95,17 +95,17 @@ def test_the_documentation_has_it(url: str) -> None:
 
 async def test_the_clients_take_a_camera(url: str) -> None:
     image = fakes.image_file()
-    for client in (LaneClient(url), InProcess(LocalEngine(fakes.engine()))):
-        check_metres(client.detect(image, camera=CAMERA))
+    for client in (LaneClient(url), InProcessClient(LocalEngine(fakes.engine()))):
+        check_meters(client.detect(image, camera=CAMERA))
         for result in client.stream([image] * 2, mode="all", camera=CAMERA):
-            check_metres(result.lanes)
+            check_meters(result.lanes)
         assert client.detect(image).lanes[0].ground is None
         if isinstance(client, LaneClient):
             client.close()
-    async with AsyncLaneClient(url) as waiting:
-        check_metres(await waiting.detect(image, camera=CAMERA))
-        async for result in waiting.stream([image] * 2, mode="all", camera=CAMERA):
-            check_metres(result.lanes)
+    async with AsyncLaneClient(url) as async_client:
+        check_meters(await async_client.detect(image, camera=CAMERA))
+        async for result in async_client.stream([image] * 2, mode="all", camera=CAMERA):
+            check_meters(result.lanes)
 
 
 def lanestream(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -128,12 +128,12 @@ def test_the_commands_take_a_camera(
     assert lanestream(monkeypatch, command, source, "--jsonl", str(results), *OPTIONS, *where) == 0
     (line,) = (json.loads(line) for line in results.read_text().splitlines())
     del line["file"]
-    check_metres(line)
+    check_meters(line)
 
 
 @pytest.mark.parametrize("command", ["detect", "stream"])
 @pytest.mark.parametrize(
-    ("options", "code", "said"),
+    ("options", "code", "message"),
     [
         (OPTIONS[:2], 1, "error: not a camera: field_of_view: "),
         (OPTIONS[2:], 1, "error: not a camera: height: "),
@@ -141,15 +141,15 @@ def test_the_commands_take_a_camera(
         (["--camera-height", "9", *OPTIONS[2:]], 2, "Usage: "),
     ],
 )
-def test_the_commands_refuse_a_bad_camera(
+def test_the_commands_refuse_an_invalid_camera(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     command: str,
     options: list[str],
     code: int,
-    said: str,
+    message: str,
 ) -> None:
     assert lanestream(monkeypatch, command, __file__, *options) == code
     errors = capsys.readouterr().err
-    assert errors.startswith(said)
+    assert errors.startswith(message)
     assert code == 2 or errors.count("\n") == 1

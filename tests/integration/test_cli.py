@@ -1,4 +1,4 @@
-"""The command line as a user meets it: what it says, where it says it, and the exit code."""
+"""The command line: its output, its errors and its exit codes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import fakes
 import httpx
 import numpy as np
 import pytest
-from scripted import Visit, refused_url, scripted
+from scripted import ScriptedConnection, refused_url, scripted
 
 from lanestream import cli
 from lanestream.api.server import listen
@@ -31,12 +31,12 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
-    """Runs `lanestream` in this process and an empty folder, with an engine of fakes: (exit code, output, errors)."""
+    """Runs `lanestream` in this process and an empty folder, with a fake engine: (exit code, output, errors)."""
 
-    def loaded(regressor: Path | None) -> Engine:
+    def load(regressor: Path | None) -> Engine:
         return fakes.engine() if regressor == Path("none") else fakes.two_detectors()
 
-    def called(*arguments: object) -> tuple[int, str, str]:
+    def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["lanestream", *map(str, arguments)])
         with pytest.raises(SystemExit) as caught:
             cli.main()
@@ -45,8 +45,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
         return int(caught.value.code or 0), output, errors
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider, regressor: LocalEngine(loaded(regressor)))
-    return called
+    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider, regressor: LocalEngine(load(regressor)))
+    return call
 
 
 @pytest.fixture
@@ -59,21 +59,21 @@ def clip(tmp_path: Path) -> Path:
     return tmp_path / "clip.mp4"
 
 
-def lines_of(path: Path) -> list[dict[str, object]]:
+def read_lines(path: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def test_help_needs_no_extra() -> None:
-    blocked = (
+    block_extras = (
         "import sys; sys.modules.update(dict.fromkeys(['cv2', 'av', 'numpy', 'onnxruntime', 'fastapi', 'torch']));"
     )
-    script = f"{blocked} from lanestream.cli import main; main()"
-    helped = subprocess.run(
+    script = f"{block_extras} from lanestream.cli import main; main()"
+    shown = subprocess.run(
         [sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True, timeout=30
     )
-    for name in ("serve", "detect", "stream", "scene", "train", "export", "evaluate", "score"):
-        assert f"  {name} " in helped.stdout
-    for arguments in (["detect", "x.jpg"], ["scene", "x.mp4"], ["serve"]):
+    for name in ("serve", "key", "doctor", "detect", "stream", "scene", "data", "train", "export", "evaluate", "score"):
+        assert re.search(rf"^  {name}  +[A-Z].+\.$", shown.stdout, re.MULTILINE), f"{name} has a line of help"
+    for arguments in (["detect", "x.jpg"], ["scene", "x.mp4"], ["doctor"], ["serve"]):
         refused = subprocess.run(
             [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False, timeout=30
         )
@@ -82,25 +82,25 @@ def test_help_needs_no_extra() -> None:
         assert "pip install 'lanestream[" in refused.stderr
 
 
-def test_detect_tells_every_image_and_goes_on_after_a_bad_one(run: Run, tmp_path: Path) -> None:
+def test_detect_reports_every_image_and_continues_after_a_bad_one(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
     (folder / "10.jpg").write_bytes(fakes.image_file())
     (folder / "2.png").write_bytes(fakes.image_file(".png"))
-    (folder / "3.jpg").write_bytes(b"no image")
+    (folder / "3.jpg").write_bytes(b"not an image")
     code, output, errors = run("detect", folder, "--annotate", "drawn", "--jsonl", "lanes.jsonl")
     assert code == 1
     assert "3 frames: 2 answered, 0 dropped, 1 failed" in output
     assert "model fake 1 on cpu" in output
     assert errors == f"error: {folder}/3.jpg: not an image: it looks like text (JPEG, PNG or WebP are accepted)\n"
-    assert [line["file"] for line in lines_of(tmp_path / "lanes.jsonl")] == [f"{folder}/2.png", f"{folder}/10.jpg"]
+    assert [line["file"] for line in read_lines(tmp_path / "lanes.jsonl")] == [f"{folder}/2.png", f"{folder}/10.jpg"]
     assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["10.jpg.lanes.jpg", "2.png.lanes.jpg"]
     code, output, _ = run("detect", folder / "2.png")
     assert code == 0
     assert re.match(rf"{folder}/2.png: 2 boundaries, ego left and right, \d+\.\d ms\n", output)
 
 
-def test_detect_writes_json_to_the_output_and_nothing_else(run: Run, tmp_path: Path) -> None:
+def test_detect_writes_only_json_to_standard_output(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(fakes.image_file())
     code, output, errors = run("detect", "a.jpg", "--jsonl", "-")
     assert code == 0
@@ -113,7 +113,7 @@ def test_stream_in_process(run: Run, clip: Path, tmp_path: Path) -> None:
     assert (code, errors) == (0, "")
     assert "10 frames: 10 answered, 0 dropped, 0 failed" in output
     assert "both ego boundaries in 100.0 %" in output
-    assert [line["seq"] for line in lines_of(tmp_path / "lanes.jsonl")] == list(range(10))
+    assert [line["seq"] for line in read_lines(tmp_path / "lanes.jsonl")] == list(range(10))
     with av.open(str(tmp_path / "drawn.mp4")) as video:
         assert [round(25 * frame.time) for frame in video.decode(video=0)] == list(range(10))
 
@@ -126,34 +126,34 @@ def test_stream_through_a_service(run: Run, clip: Path, url: str, mode: str) -> 
     assert "model fake 1 on cpu" in output
 
 
-def test_a_stream_over_replicas_says_what_its_connection_cost(run: Run, clip: Path) -> None:
-    def breaking(visit: Visit) -> None:
-        visit.open()
-        assert visit.frame() == 0
-        visit.break_off()
+def test_a_stream_over_replicas_reports_a_lost_connection(run: Run, clip: Path) -> None:
+    def breaking(connection: ScriptedConnection) -> None:
+        connection.open()
+        assert connection.receive_frame() == 0
+        connection.break_off()
 
-    def resumed(visit: Visit) -> None:
-        visit.open(session="cam-7", resumed=True, last_seq=0)
-        visit.finish()
+    def resumed(connection: ScriptedConnection) -> None:
+        connection.open(session="cam-7", resumed=True, last_seq=0)
+        connection.finish()
 
     with scripted(breaking, resumed) as script:
         code, output, errors = run("stream", clip, "--url", refused_url(), "--url", script.url, "--session", "cam-7")
     assert code == 0
     assert errors.splitlines() == [
-        "the connection was lost and is back: session cam-7 goes on",
-        "frame 0: the answer to this frame was lost with the connection",
+        "reconnected after a lost connection: session cam-7 was resumed",
+        "frame 0: the result of this frame was lost with the connection",
     ]
     assert "10 frames: 9 answered, 0 dropped, 0 failed, 1 lost; " in output
     assert "model m on cpu" in output
     assert [start["session"] for start in script.starts] == ["cam-7"] * 2
 
 
-def test_a_stream_that_can_not_go_on_is_summed_up_first(run: Run, clip: Path) -> None:
-    def breaking(visit: Visit) -> None:
-        visit.open()
-        visit.answer(visit.frame())
-        assert visit.frame() == 1
-        visit.close(1012)
+def test_a_stream_that_fails_prints_its_report_first(run: Run, clip: Path) -> None:
+    def breaking(connection: ScriptedConnection) -> None:
+        connection.open()
+        connection.send_lanes(connection.receive_frame())
+        assert connection.receive_frame() == 1
+        connection.close(1012)
 
     with scripted(breaking) as script:
         code, output, errors = run("stream", clip, "--url", script.url, "--reconnect", "0")
@@ -162,12 +162,12 @@ def test_a_stream_that_can_not_go_on_is_summed_up_first(run: Run, clip: Path) ->
     assert errors.splitlines()[-1] == "error: the service closed the stream with code 1012"
 
 
-@pytest.mark.parametrize("way", ["option", "environment"])
-def test_a_key_is_sent_and_not_shown(run: Run, clip: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    if way == "environment":
+@pytest.mark.parametrize("given_as", ["option", "environment"])
+def test_a_key_is_sent_and_not_printed(run: Run, clip: Path, monkeypatch: pytest.MonkeyPatch, given_as: str) -> None:
+    if given_as == "environment":
         monkeypatch.setenv("LANESTREAM_API_KEY", "hidden-key")
     with scripted(UnauthorizedError("no such key", "ask for one")) as script:
-        key = ["--api-key", "hidden-key"] if way == "option" else []
+        key = ["--api-key", "hidden-key"] if given_as == "option" else []
         code, output, errors = run("stream", clip, "--url", script.url, *key)
     assert (code, output, errors) == (1, "", "error: no such key (ask for one)\n")
     assert script.headers[0]["Authorization"] == "Bearer hidden-key"
@@ -175,17 +175,15 @@ def test_a_key_is_sent_and_not_shown(run: Run, clip: Path, monkeypatch: pytest.M
     assert (code, "the API key can't be sent" in errors, "hidden" in output + errors) == (1, True, False)
 
 
-def test_a_key_in_the_environment_is_no_matter_in_process(
-    run: Run, clip: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_key_in_the_environment_is_ignored_in_process(run: Run, clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LANESTREAM_API_KEY", "hidden-key")
     assert run("stream", clip)[0] == 0
 
 
 @pytest.mark.parametrize("options", [("--api-key", "k"), ("--reconnect", "1"), ("--session", "cam-7")])
-def test_options_about_a_service_need_one(run: Run, clip: Path, options: tuple[str, str]) -> None:
+def test_service_options_need_a_url(run: Run, clip: Path, options: tuple[str, str]) -> None:
     code, _, errors = run("stream", clip, *options)
-    assert (code, "for the service at --url" in errors) == (2, True)
+    assert (code, "add --url" in errors) == (2, True)
 
 
 @pytest.mark.parametrize(("detector", "count", "model"), [("candidates", 2, "fake 1"), ("regression", 1, "other 2")])
@@ -196,22 +194,22 @@ def test_the_detector_can_be_chosen(
     where = ["--url", both_url] if remote else []
     code, output, _ = run("stream", clip, "--detector", detector, "--jsonl", "lanes.jsonl", *where)
     assert (code, f"model {model} on cpu" in output) == (0, True)
-    assert [len(line["lanes"]) for line in lines_of(Path("lanes.jsonl"))] == [count] * 10
+    assert [len(line["lanes"]) for line in read_lines(Path("lanes.jsonl"))] == [count] * 10
     Path("a.jpg").write_bytes(fakes.image_file())
     code, output, _ = run("detect", "a.jpg", "--detector", detector, *where)
     assert (code, f"model {model} on cpu" in output) == (0, True)
     assert f"a.jpg: {count} " in output
 
 
-def test_a_detector_that_is_not_there_is_told_in_a_line(run: Run, clip: Path, url: str) -> None:
+def test_a_detector_that_is_not_loaded_is_reported_in_one_line(run: Run, clip: Path, url: str) -> None:
     Path("a.jpg").write_bytes(fakes.image_file())
-    told = "error: there is no detector regression here (ask for candidates)\n"
+    message = "error: there is no detector regression here (ask for candidates)\n"
     for where in (["--url", url], ["--regressor", "none"]):
         for command in (["stream", clip], ["detect", "a.jpg"]):
-            assert run(*command, "--detector", "regression", *where) == (1, "", told)
+            assert run(*command, "--detector", "regression", *where) == (1, "", message)
 
 
-def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_path: Path) -> None:
+def test_stream_of_a_folder_names_files_and_continues_after_a_bad_one(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
     for number in (1, 2, 10):
@@ -221,7 +219,7 @@ def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_
     assert code == 0
     assert "4 frames: 3 answered, 0 dropped, 1 failed" in output
     assert errors == "frame 2: the JPEG image is cut short: its end is missing\n"
-    lines = lines_of(tmp_path / "lanes.jsonl")
+    lines = read_lines(tmp_path / "lanes.jsonl")
     assert [(line["file"], line["type"]) for line in lines] == [
         ("1.jpg", "lanes"),
         ("2.jpg", "lanes"),
@@ -232,11 +230,11 @@ def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["stream", "none.mp4"], 1, "error: no such file or folder: none.mp4 ("),
         (["stream", "text.mp4"], 1, "error: can't open text.mp4: invalid data found when processing input ("),
-        (["stream", "empty"], 1, "error: no image in the folder empty ("),
+        (["stream", "empty"], 1, "error: no images in the folder empty ("),
         (
             ["stream", "rtsp://user:secret@127.0.0.1:9/x"],
             1,
@@ -247,16 +245,17 @@ def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_
             1,
             "error: can't reach the service at http://127.0.0.1:9: ",
         ),
-        (["stream", "clip.mp4", "--url", "gopher://x"], 1, "error: 'gopher://x' is no address of a service ("),
+        (["stream", "clip.mp4", "--url", "gopher://x"], 1, "error: 'gopher://x' is not a valid service URL ("),
         (["stream", "clip.mp4", "--url", "x", "--model", "m.onnx"], 2, "Usage:"),
         (["stream", "clip.mp4", "--video", "/dev/null/x.mp4"], 1, "error: can't write /dev/null/x.mp4: "),
         (["stream", "clip.mp4", "--jsonl", "/dev/null/x.jsonl"], 1, "error: can't write /dev/null/x.jsonl: "),
         (["stream", "clip.mp4", "--url", "x", "--regressor", "none"], 2, "Usage:"),
         (["stream", "clip.mp4", "--mode", "some"], 2, "Usage:"),
-        (["stream", "clip.mp4", "--detector", "guesses"], 2, "Usage:"),
+        (["stream", "clip.mp4", "--detector", "unknown"], 2, "Usage:"),
+        (["stream", "clip.mp4", "--provider", "tpu"], 2, "Usage:"),
         (["stream"], 2, "Usage:"),
         (["detect", "none.jpg"], 1, "error: can't read none.jpg: no such file or directory"),
-        (["detect", "empty"], 1, "error: no image in the folder empty ("),
+        (["detect", "empty"], 1, "error: no images in the folder empty ("),
         (["detect", "x.jpg", "--horizon", "2"], 2, "Usage:"),
         (["scene", "/dev/null/x.mp4"], 1, "error: can't write /dev/null/x.mp4: "),
         (["scene", "x.mp4", "--size", "641x360"], 2, "Usage:"),
@@ -264,18 +263,18 @@ def test_stream_of_a_folder_tells_the_file_and_survives_a_bad_one(run: Run, tmp_
         (["fly"], 2, "Usage:"),
     ],
 )
-def test_mistakes_are_told_in_a_line(
-    run: Run, clip: Path, tmp_path: Path, arguments: list[str], code: int, said: str
+def test_wrong_arguments_are_reported_in_one_line(
+    run: Run, clip: Path, tmp_path: Path, arguments: list[str], code: int, message: str
 ) -> None:
-    (tmp_path / "text.mp4").write_text("no video")
+    (tmp_path / "text.mp4").write_text("not a video")
     (tmp_path / "empty").mkdir()
     found, _, errors = run(*arguments)
-    assert (found, errors[: len(said)]) == (code, said)
+    assert (found, errors[: len(message)]) == (code, message)
     assert code == 2 or errors.count("\n") == 1
     assert "secret" not in errors
 
 
-def test_a_busy_port_is_told(run: Run) -> None:
+def test_a_port_in_use_is_reported(run: Run) -> None:
     with listen("127.0.0.1", 0) as busy:
         port = busy.getsockname()[1]
         assert run("serve", "--port", port) == (
@@ -285,7 +284,7 @@ def test_a_busy_port_is_told(run: Run) -> None:
         )
 
 
-def test_a_bad_variable_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_environment_variable_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LANESTREAM_PORT", "many")
     code, _, errors = run("serve")
     assert (code, errors.count("\n")) == (1, 1)
@@ -304,7 +303,7 @@ def test_settings_are_printed_without_their_secrets(run: Run, monkeypatch: pytes
     assert "5ec7e7" not in output
 
 
-def test_a_password_is_not_told_where_the_url_is_none(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_url_is_reported_without_its_password(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LANESTREAM_REDIS_URL", "redis://:secret/word@host:6379")
     code, _, errors = run("serve", "--port", "0")
     assert (code, errors.count("\n")) == (1, 1)
@@ -312,7 +311,7 @@ def test_a_password_is_not_told_where_the_url_is_none(run: Run, monkeypatch: pyt
     assert "secret" not in errors
 
 
-def test_a_name_of_a_key_that_can_not_be_is_told(run: Run) -> None:
+def test_an_invalid_key_name_is_reported(run: Run) -> None:
     code, output, errors = run("key", "camera 7")
     assert (code, output) == (1, "")
     assert errors.startswith("error: 'camera 7' can't be the name of a key (")
@@ -320,15 +319,15 @@ def test_a_name_of_a_key_that_can_not_be_is_told(run: Run) -> None:
 
 @pytest.mark.parametrize("option", ["--model", "--regressor"])
 @pytest.mark.parametrize("name", ["model.onnx", "none.onnx"])
-def test_a_model_that_is_none_ends_the_service(run: Run, tmp_path: Path, option: str, name: str) -> None:
-    (tmp_path / "model.onnx").write_text("no model")
+def test_an_invalid_model_ends_the_service(run: Run, tmp_path: Path, option: str, name: str) -> None:
+    (tmp_path / "model.onnx").write_text("not a model")
     code, _, errors = run("serve", "--port", "0", option, name)
     assert code == 1
     assert errors.splitlines()[-1].startswith("error: ")
     assert name in errors.splitlines()[-1]
 
 
-def test_the_regressor_can_be_named_by_a_variable(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_regressor_can_be_set_by_an_environment_variable(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LANESTREAM_REGRESSOR", "none.onnx")
     code, _, errors = run("serve", "--port", "0")
     assert code == 1
@@ -337,18 +336,18 @@ def test_the_regressor_can_be_named_by_a_variable(run: Run, monkeypatch: pytest.
 
 @pytest.fixture
 def service() -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`lanestream serve` in a process of its own, with its URL."""
+    """Runs `lanestream serve` in another process; yields the process and its URL."""
     command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        told = next(line for line in process.stderr if "listening on" in line)
+        line = next(line for line in process.stderr if "listening on" in line)
         try:
-            yield process, told.split("listening on ")[1].split(",")[0]
+            yield process, line.split("listening on ")[1].split(",")[0]
         finally:
             process.kill()
 
 
-def test_the_service_lives_before_it_is_ready_and_ends_cleanly(service: tuple[subprocess.Popen[str], str]) -> None:
+def test_the_service_is_alive_before_it_is_ready_and_ends_cleanly(service: tuple[subprocess.Popen[str], str]) -> None:
     process, url = service
     statuses = [httpx.get(f"{url}/readyz").status_code]
     assert httpx.get(f"{url}/healthz").status_code == 200
@@ -362,16 +361,16 @@ def test_the_service_lives_before_it_is_ready_and_ends_cleanly(service: tuple[su
     assert "Traceback" not in errors
 
 
-def test_an_interrupt_ends_a_stream_with_its_summary(tmp_path: Path, real_engine: Engine) -> None:
+def test_an_interrupted_stream_prints_its_report(tmp_path: Path, real_engine: Engine) -> None:
     video = tmp_path / "long.mp4"
     with video_sink(video, 25.0) as sink:
         assert sink is not None
-        picture = cv2.imdecode(np.frombuffer(fakes.image_file(), np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(fakes.image_file(), np.uint8), cv2.IMREAD_COLOR)
         for number in range(500):
-            sink.write(picture, number / 25.0)
-    # A shell that starts its tests in the background has them ignore Ctrl-C, and so would whatever they start.
-    heeding = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{heeding}; from lanestream.cli import main; main()"]
+            sink.write(image, number / 25.0)
+    # A shell makes background jobs ignore Ctrl-C, and so their child processes, such as this one.
+    restore_interrupt = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{restore_interrupt}; from lanestream.cli import main; main()"]
     command += ["stream", str(video), "--jsonl", "/dev/stdout", "--video", "drawn.mp4"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
@@ -388,7 +387,7 @@ def test_an_interrupt_ends_a_stream_with_its_summary(tmp_path: Path, real_engine
         assert sum(1 for _ in drawn.decode(video=0)) > 0
 
 
-def test_a_reader_that_has_had_enough_is_no_error(clip: Path) -> None:
+def test_a_closed_pipe_is_not_an_error(clip: Path) -> None:
     script = f'"{sys.executable}" -m lanestream.cli stream "{clip}" --jsonl - | head -n 1 | cut -c 1-16'
     done = subprocess.run(["/bin/sh", "-c", script], capture_output=True, text=True, check=True, timeout=30)
     assert done.stdout == '{"type": "lanes"\n'

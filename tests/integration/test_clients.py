@@ -1,9 +1,8 @@
-"""The clients against real servers: the one that blocks and the one that awaits."""
+"""The blocking and the async client against real servers."""
 
 from __future__ import annotations
 
 import re
-import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import fakes
 import pytest
+from scripted import refused_url
 from websockets.sync.server import ServerConnection
 from websockets.sync.server import serve as ws_serve
 
@@ -28,8 +28,8 @@ from lanestream.errors import (
 from lanestream.local import LocalEngine
 from lanestream.protocol import LanesMessage
 from lanestream_client import AsyncLaneClient, LaneClient, SourceFrame
-from lanestream_client.in_process import InProcess
-from lanestream_client.service import ServiceInfo
+from lanestream_client.in_process import InProcessClient
+from lanestream_client.requests import ServiceInfo
 
 Serve = Callable[..., str]
 PAGE = Path(__file__).parents[2] / "docs" / "client.md"
@@ -45,13 +45,6 @@ def positions(lanes: LanesMessage | None) -> list[int]:
     return [lane.position for lane in lanes.lanes]
 
 
-@pytest.fixture
-def nobody() -> str:
-    """The URL of a port that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return f"http://127.0.0.1:{probe.getsockname()[1]}"
-
-
 def test_detect_takes_bytes_and_paths(url: str, tmp_path: Path) -> None:
     path = tmp_path / "road.jpg"
     path.write_bytes(fakes.image_file())
@@ -62,13 +55,13 @@ def test_detect_takes_bytes_and_paths(url: str, tmp_path: Path) -> None:
         with pytest.raises(ImageError, match="looks like text"):
             client.detect(b"text")
         with pytest.raises(SourceError, match="no such file"):
-            client.detect(tmp_path / "none.jpg")
+            client.detect(tmp_path / "missing.jpg")
         with pytest.raises(ProtocolError, match="horizon"):
             client.detect(path, horizon=7.0)
 
 
 @pytest.mark.parametrize("mode", ["all", "latest"])
-def test_a_source_that_can_wait_loses_nothing(url: str, mode: str) -> None:
+def test_no_frame_of_a_file_is_lost(url: str, mode: str) -> None:
     with LaneClient(url) as client:
         stream = client.stream(frames(30), mode=mode)
         results = list(stream)
@@ -80,7 +73,7 @@ def test_a_source_that_can_wait_loses_nothing(url: str, mode: str) -> None:
     assert (stream.summary.answered, stream.summary.dropped) == (30, 0)
 
 
-def test_errors_of_frames_come_in_their_place(url: str) -> None:
+def test_errors_of_frames_come_in_frame_order(url: str) -> None:
     good = fakes.image_file()
     with LaneClient(url) as client:
         stream = client.stream([good, b"text", good, bytes(300_000), fakes.image_file(shade=255), good])
@@ -90,10 +83,10 @@ def test_errors_of_frames_come_in_their_place(url: str) -> None:
     assert [result.frame.seq for result in results] == list(range(6))
 
 
-def test_a_source_that_fails_is_told_after_what_it_gave(url: str) -> None:
+def test_a_source_error_is_raised_after_the_results_of_earlier_frames(url: str) -> None:
     def failing() -> Iterator[SourceFrame]:
         yield from frames(5)
-        raise SourceError("the cable is out")
+        raise SourceError("the cable is unplugged")
 
     with LaneClient(url) as client:
         results = iter(client.stream(failing(), mode="all"))
@@ -102,7 +95,7 @@ def test_a_source_that_fails_is_told_after_what_it_gave(url: str) -> None:
             next(results)
 
 
-def test_breaking_off_early_is_clean(url: str) -> None:
+def test_a_stream_can_be_closed_early(url: str) -> None:
     def endless() -> Iterator[SourceFrame]:
         data = fakes.image_file()
         seq = 0
@@ -116,36 +109,36 @@ def test_breaking_off_early_is_clean(url: str) -> None:
         results.close()
 
 
-def test_numbers_must_rise(url: str) -> None:
+def test_frame_numbers_must_rise(url: str) -> None:
     data = fakes.image_file()
     with LaneClient(url) as client, pytest.raises(ProtocolError, match="must rise"):
         list(client.stream([SourceFrame(1, 0.0, data=data), SourceFrame(1, 0.1, data=data)]))
 
 
-def test_a_service_that_is_not_there_is_told_in_a_line(nobody: str) -> None:
-    with LaneClient(nobody) as client:
+def test_an_unreachable_service_is_reported_in_one_line() -> None:
+    with LaneClient(refused_url()) as client:
         for call in (client.describe, lambda: client.detect(b"x"), lambda: list(client.stream([b"x"]))):
             with pytest.raises(ConnectionFailedError, match=r"can't reach .*refused \(start one with"):
                 call()
 
 
-def test_something_else_at_the_url_is_told(url: str) -> None:
+def test_another_server_at_the_url_is_reported(url: str) -> None:
     with LaneClient(f"{url}/elsewhere") as client:
         with pytest.raises(ConnectionFailedError, match="answered 403"):
             list(client.stream([b"x"]))
         with pytest.raises(Exception, match="Not Found"):
             client.detect(b"x")
-    with pytest.raises(SettingsError, match="no address"):
+    with pytest.raises(SettingsError, match="not a valid service URL"):
         LaneClient("ftp://somewhere")
 
 
-def test_refusals_have_their_types(serve: Serve) -> None:
+def test_refusals_raise_their_error_classes(serve: Serve) -> None:
     with LaneClient(serve()) as client:
         for call in (client.describe, lambda: client.detect(b"x"), lambda: list(client.stream([b"x"]))):
             with pytest.raises(NotReadyError):
                 call()
-    place = serve(fakes.engine(), max_sessions=1)
-    with LaneClient(place) as one, LaneClient(place) as other:
+    replica = serve(fakes.engine(), max_sessions=1)
+    with LaneClient(replica) as one, LaneClient(replica) as other:
         holding = iter(one.stream(frames(1000), mode="all"))
         next(holding)
         with pytest.raises(BusyError):
@@ -165,7 +158,7 @@ def test_the_detector_can_be_chosen(both_url: str) -> None:
         assert (stream.ready.detector, stream.ready.model) == ("regression", "other 2")
 
 
-async def test_the_detector_can_be_chosen_by_the_awaiting_client(both_url: str) -> None:
+async def test_the_detector_can_be_chosen_with_the_async_client(both_url: str) -> None:
     async with AsyncLaneClient(both_url) as client:
         assert await client.describe("regression") == ServiceInfo("other 2", "cpu")
         assert positions(await client.detect(fakes.image_file(), detector="regression")) == [-1]
@@ -174,27 +167,27 @@ async def test_the_detector_can_be_chosen_by_the_awaiting_client(both_url: str) 
         assert [(positions(a.lanes), positions(b.lanes)) for a, b in both] == [([-1, 1], [-1])] * 3
 
 
-async def test_a_detector_that_is_not_there_has_its_type(url: str) -> None:
-    told = r"no detector regression.*\(ask for candidates\)"
+async def test_a_detector_that_is_not_loaded_is_refused(url: str) -> None:
+    message = r"no detector regression.*\(ask for candidates\)"
     with LaneClient(url) as client:
         for call in (
             lambda: client.describe("regression"),
             lambda: client.detect(fakes.image_file(), detector="regression"),
             lambda: list(client.stream(frames(1), detector="regression")),
         ):
-            with pytest.raises(NoDetectorError, match=told):
+            with pytest.raises(NoDetectorError, match=message):
                 call()
         with pytest.raises(ProtocolError, match="'candidates' or 'regression'"):
-            list(client.stream(frames(1), detector="guesses"))
+            list(client.stream(frames(1), detector="unknown"))
     async with AsyncLaneClient(url) as client:
-        with pytest.raises(NoDetectorError, match=told):
+        with pytest.raises(NoDetectorError, match=message):
             await client.detect(fakes.image_file(), detector="regression")
-        with pytest.raises(NoDetectorError, match=told):
+        with pytest.raises(NoDetectorError, match=message):
             _ = [result async for result in client.stream(frames(1), detector="regression")]
 
 
 def test_the_detector_can_be_chosen_in_process() -> None:
-    local = InProcess(LocalEngine(fakes.two_detectors()))
+    local = InProcessClient(LocalEngine(fakes.two_detectors()))
     assert local.describe() == ServiceInfo("fake 1", "cpu")
     assert local.describe("regression") == ServiceInfo("other 2", "cpu")
     assert positions(local.detect(fakes.image_file())) == [-1, 1]
@@ -202,12 +195,12 @@ def test_the_detector_can_be_chosen_in_process() -> None:
     one, other = local.stream(frames(3)), local.stream(frames(3), detector="regression")
     both = zip(one, other, strict=True)
     assert [(positions(a.lanes), positions(b.lanes)) for a, b in both] == [([-1, 1], [-1])] * 3
-    only = InProcess(LocalEngine(fakes.engine()))
+    one_detector = InProcessClient(LocalEngine(fakes.engine()))
     with pytest.raises(NoDetectorError, match="ask for candidates"):
-        only.stream(frames(1), detector="regression")
+        one_detector.stream(frames(1), detector="regression")
 
 
-async def test_the_awaiting_client_does_the_same(url: str, tmp_path: Path) -> None:
+async def test_the_async_client_gives_the_same_results(url: str, tmp_path: Path) -> None:
     path = tmp_path / "road.jpg"
     path.write_bytes(fakes.image_file())
     async with AsyncLaneClient(url) as client:
@@ -223,24 +216,24 @@ async def test_the_awaiting_client_does_the_same(url: str, tmp_path: Path) -> No
         assert stream.summary.failed == 1
 
 
-async def test_the_awaiting_client_takes_a_source_that_awaits(url: str) -> None:
+async def test_the_async_client_takes_an_async_source(url: str) -> None:
     async def failing() -> AsyncIterator[SourceFrame]:
         for frame in frames(7):
             yield frame
-        raise SourceError("the cable is out")
+        raise SourceError("the cable is unplugged")
 
     async with AsyncLaneClient(url) as client:
         results = aiter(client.stream(failing(), mode="all"))
         assert [(await anext(results)).frame.seq for _ in range(7)] == list(range(7))
         with pytest.raises(SourceError, match="cable"):
             await anext(results)
-        breaking_off = client.stream(frames(1000)).__aiter__()
-        assert (await anext(breaking_off)).frame.seq == 0
-        await breaking_off.aclose()
+        unfinished = client.stream(frames(1000)).__aiter__()
+        assert (await anext(unfinished)).frame.seq == 0
+        await unfinished.aclose()
 
 
-async def test_the_awaiting_client_tells_failures_alike(nobody: str) -> None:
-    async with AsyncLaneClient(nobody) as client:
+async def test_the_async_client_raises_the_same_errors() -> None:
+    async with AsyncLaneClient(refused_url()) as client:
         with pytest.raises(ConnectionFailedError):
             await client.describe()
         with pytest.raises(ConnectionFailedError):
@@ -248,12 +241,12 @@ async def test_the_awaiting_client_tells_failures_alike(nobody: str) -> None:
 
 
 @contextmanager
-def dying(*said: str, code: int = 1012) -> Iterator[str]:
-    """The URL of a service that says what it has to say to `start`, then closes with `code`."""
+def closing_service(*messages: str, code: int = 1012) -> Iterator[str]:
+    """Yields the URL of a service that answers `start` with `messages` and closes with `code`."""
 
     def handle(connection: ServerConnection) -> None:
         connection.recv()
-        for text in said:
+        for text in messages:
             connection.send(text)
         connection.close(code, "restarting")
 
@@ -270,34 +263,33 @@ def dying(*said: str, code: int = 1012) -> Iterator[str]:
 READY = fakes.ready()
 
 
-@pytest.mark.parametrize("said", [(), (READY.model_dump_json(),)])
-def test_a_service_that_goes_away_is_told(said: tuple[str, ...]) -> None:
-    told = "closed the stream with code 1012: restarting"
+@pytest.mark.parametrize("messages", [(), (READY.model_dump_json(),)])
+def test_a_service_that_closes_the_stream_is_reported(messages: tuple[str, ...]) -> None:
     with (
-        dying(*said) as place,
-        LaneClient(place, reconnect_s=0.0) as client,
-        pytest.raises(ConnectionFailedError, match=told),
+        closing_service(*messages) as replica,
+        LaneClient(replica, reconnect_s=0.0) as client,
+        pytest.raises(ConnectionFailedError, match="closed the stream with code 1012: restarting"),
     ):
         list(client.stream(frames(100), mode="all"))
 
 
-async def test_a_service_that_goes_away_is_told_to_the_awaiting_client() -> None:
-    with dying(READY.model_dump_json()) as place:
-        async with AsyncLaneClient(place, reconnect_s=0.0) as client:
+async def test_the_async_client_reports_a_service_that_closes_the_stream() -> None:
+    with closing_service(READY.model_dump_json()) as replica:
+        async with AsyncLaneClient(replica, reconnect_s=0.0) as client:
             with pytest.raises(ConnectionFailedError, match="1012"):
                 _ = [result async for result in client.stream(frames(100), mode="all")]
 
 
-def test_a_message_that_was_too_big_is_told_as_that() -> None:
+def test_the_close_code_of_a_too_large_message_has_its_error() -> None:
     with (
-        dying(READY.model_dump_json(), code=1009) as place,
-        LaneClient(place) as client,
+        closing_service(READY.model_dump_json(), code=1009) as replica,
+        LaneClient(replica) as client,
         pytest.raises(ImageTooLargeError),
     ):
         list(client.stream(frames(100), mode="all"))
 
 
-def test_the_code_of_the_page_about_the_client(
+def test_the_examples_of_the_client_page_work(
     url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "road.jpg").write_bytes(fakes.image_file())

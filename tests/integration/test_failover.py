@@ -1,11 +1,11 @@
-"""Streams of the clients over real services that break, stop or are killed."""
+"""Client streams over real services whose connections break, or that drain or are killed."""
 
 from __future__ import annotations
 
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,14 +18,13 @@ from redisserver import redis_server
 from lanestream.protocol import EgoModel
 from lanestream_client import LaneClient, SourceFrame, StreamResult
 
-Serve = Callable[..., str]
 STREAMS = 4
 IN_FLIGHT = 2
-PATIENCE_S = 6 * fakes.WAIT_S  # for networks that are loaded and run beside other tests
+SLOW_WAIT_S = 6 * fakes.WAIT_S  # loading and running real networks is slow when other tests run in parallel
 
 
-class Relay:
-    """Passes connections on to a service, until they are cut."""
+class TcpProxy:
+    """Forwards connections to a service until they are cut."""
 
     def __init__(self, listener: socket.socket, url: str) -> None:
         host, _, port = url.removeprefix("http://").partition(":")
@@ -35,15 +34,15 @@ class Relay:
         self.url = f"http://127.0.0.1:{listener.getsockname()[1]}"
 
     def run(self) -> None:
-        with suppress(OSError):  # when it is closed
+        with suppress(OSError):  # raised when the listener is closed
             while True:
                 ends = [self._listener.accept()[0], socket.create_connection(self._target)]
                 self._sockets += ends
                 for source, sink in (ends, ends[::-1]):
-                    threading.Thread(target=self._pass_on, args=(source, sink)).start()
+                    threading.Thread(target=self._forward, args=(source, sink)).start()
 
     def cut(self) -> None:
-        """Breaks the connections that there are."""
+        """Breaks all open connections."""
         for end in self._sockets:
             with suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
@@ -51,7 +50,7 @@ class Relay:
         self._sockets.clear()
 
     @staticmethod
-    def _pass_on(source: socket.socket, sink: socket.socket) -> None:
+    def _forward(source: socket.socket, sink: socket.socket) -> None:
         with suppress(OSError):
             while data := source.recv(65536):
                 sink.sendall(data)
@@ -60,43 +59,43 @@ class Relay:
 
 
 @contextmanager
-def relayed(url: str) -> Iterator[Relay]:
+def tcp_proxy(url: str) -> Iterator[TcpProxy]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        relay = Relay(listener, url)
-        thread = threading.Thread(target=relay.run)
+        proxy = TcpProxy(listener, url)
+        thread = threading.Thread(target=proxy.run)
         thread.start()
         try:
-            yield relay
+            yield proxy
         finally:
-            relay.cut()
+            proxy.cut()
             listener.shutdown(socket.SHUT_RDWR)
             thread.join(fakes.WAIT_S)
 
 
-def frames(count: int, picture: bytes | None = None) -> Iterator[SourceFrame]:
-    data = picture or fakes.image_file()
+def frames(count: int, image: bytes | None = None) -> Iterator[SourceFrame]:
+    data = image or fakes.image_file()
     return (SourceFrame(seq, 0.04 * seq, data=data) for seq in range(count))
 
 
-def ids(results: list[StreamResult]) -> set[int]:
+def track_ids(results: list[StreamResult]) -> set[int]:
     return {lane.track_id for result in results if result.lanes is not None for lane in result.lanes.lanes}
 
 
 @pytest.mark.parametrize("mode", ["all", "latest"])
-def test_ids_go_on_over_broken_connections(url: str, mode: str) -> None:
-    with relayed(url) as relay, LaneClient(relay.url, in_flight=3) as client:
+def test_track_ids_survive_broken_connections(url: str, mode: str) -> None:
+    with tcp_proxy(url) as proxy, LaneClient(proxy.url, in_flight=3) as client:
         stream = client.stream(frames(60), mode=mode, session="cut-off")
         results = []
         for result in stream:
             results.append(result)
             if len(results) in (20, 40):
-                relay.cut()
+                proxy.cut()
     numbers = [result.frame.seq for result in results]
     assert numbers == sorted(set(numbers))
     assert stream.reconnects == 2
     assert stream.ready is not None
     assert (stream.ready.resumed, stream.ready.session) == (True, "cut-off")
-    assert ids(results) == {1, 2}
+    assert track_ids(results) == {1, 2}
     total = stream.summary
     assert total is not None
     assert (total.frames, total.dropped) == (60, 60 - len(results))
@@ -105,13 +104,17 @@ def test_ids_go_on_over_broken_connections(url: str, mode: str) -> None:
 
 
 @dataclass
-class Camera:
-    """A client in mode `all` that streams a picture over whichever replica is there, until it was told enough."""
+class CameraClient:
+    """Streams one image in mode `all`, over any of the replicas, until `stop` is set.
+
+    Waits at `barrier` when its first stream is running, and when it has reconnected. `egos` holds the latest ego lane
+    of each connection.
+    """
 
     urls: list[str]
-    picture: bytes
-    under_way: threading.Barrier
-    enough: threading.Event
+    image: bytes
+    barrier: threading.Barrier
+    stop: threading.Event
     results: list[StreamResult] = field(default_factory=list)
     egos: list[EgoModel] = field(default_factory=list)
     frames: int = 0
@@ -122,7 +125,7 @@ class Camera:
             for result in stream:
                 self.results.append(result)
                 if len(self.results) == 6:
-                    self.under_way.wait(PATIENCE_S)
+                    self.barrier.wait(SLOW_WAIT_S)
                 if result.lanes is not None and stream.reconnects == len(self.egos) - 1:
                     self.egos[-1] = result.lanes.ego
                 elif result.lanes is not None:
@@ -130,36 +133,36 @@ class Camera:
                     assert stream.ready is not None
                     assert stream.ready.resumed == (stream.reconnects > 0)
                     if stream.reconnects:
-                        self.under_way.wait(PATIENCE_S)
+                        self.barrier.wait(SLOW_WAIT_S)
             assert stream.summary is not None
             assert stream.summary.frames == stream.summary.answered + stream.summary.lost
 
     def _source(self) -> Iterator[SourceFrame]:
-        for frame in frames(100_000, self.picture):
-            if self.enough.is_set():
+        for frame in frames(100_000, self.image):
+            if self.stop.is_set():
                 return
             self.frames += 1
             yield frame
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM], ids=["killed", "drained"])
-def test_every_stream_goes_on_at_the_other_replica(tmp_path: Path, road: bytes, end: signal.Signals) -> None:
+def test_every_stream_continues_on_the_other_replica(tmp_path: Path, road: bytes, end: signal.Signals) -> None:
     with (
         redis_server(tmp_path) as redis_url,
         service(redis_url=redis_url, regressor="none") as (process, one),
         service(redis_url=redis_url, regressor="none") as (_, other),
     ):
-        under_way, enough = threading.Barrier(STREAMS + 1), threading.Event()
-        cameras = [Camera([one, other], road, under_way, enough) for _ in range(STREAMS)]
+        barrier, stop = threading.Barrier(STREAMS + 1), threading.Event()
+        cameras = [CameraClient([one, other], road, barrier, stop) for _ in range(STREAMS)]
         threads = [threading.Thread(target=camera.run) for camera in cameras]
         for thread in threads:
             thread.start()
-        under_way.wait(PATIENCE_S)
+        barrier.wait(SLOW_WAIT_S)
         process.send_signal(end)
-        under_way.wait(PATIENCE_S)
-        enough.set()
+        barrier.wait(SLOW_WAIT_S)
+        stop.set()
         for thread in threads:
-            thread.join(PATIENCE_S)
+            thread.join(SLOW_WAIT_S)
     for camera in cameras:
         before, after = camera.egos
         assert None not in (before.left, before.right)

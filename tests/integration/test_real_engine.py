@@ -21,8 +21,8 @@ from lanestream.inference.model_info import METADATA_KEY
 from lanestream.local import LocalEngine
 from lanestream.protocol import DetectorName, LanesMessage
 from lanestream_client import LaneClient, SourceFrame
-from lanestream_client.in_process import InProcess
-from lanestream_client.service import ServiceInfo
+from lanestream_client.in_process import InProcessClient
+from lanestream_client.requests import ServiceInfo
 from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
 Serve = Callable[..., str]
@@ -99,7 +99,7 @@ def test_both_ego_boundaries_are_followed(real_url: str, drive: list[bytes]) -> 
 
 
 def test_a_stream_in_process_gives_the_same(real_url: str, real_engine: Engine, drive: list[bytes]) -> None:
-    local = InProcess(LocalEngine(real_engine))
+    local = InProcessClient(LocalEngine(real_engine))
     with LaneClient(real_url) as client:
         remote = [without_timing(result.lanes) for result in client.stream(frames(drive), mode="all")]
         assert without_timing(client.detect(drive[0])) == remote[0]
@@ -140,7 +140,7 @@ def test_a_regressor_beside_the_model_is_a_detector_of_its_own(
     serve: Serve, drive: list[bytes], regressor: Path
 ) -> None:
     engine = load_engine(None, "cpu", regressor)
-    local = InProcess(LocalEngine(engine))
+    local = InProcessClient(LocalEngine(engine))
     with LaneClient(serve(engine)) as client:
         assert client.describe("regression").model == "steadfast 1"
         assert client.describe().model == local.describe("candidates").model != "steadfast 1"
@@ -157,7 +157,7 @@ def test_a_regressor_beside_the_model_is_a_detector_of_its_own(
 
 
 def test_a_regressor_as_the_model_is_the_only_detector(regressor: Path, drive: list[bytes]) -> None:
-    local = InProcess(LocalEngine.load(regressor, "cpu"))
+    local = InProcessClient(LocalEngine.load(regressor, "cpu"))
     assert local.describe() == local.describe("regression") == ServiceInfo("steadfast 1", "cpu")
     assert len(local.detect(drive[0]).lanes) == 2
     with pytest.raises(NoDetectorError, match="ask for regression"):
@@ -165,7 +165,7 @@ def test_a_regressor_as_the_model_is_the_only_detector(regressor: Path, drive: l
 
 
 def test_a_model_may_go_without_a_regressor(drive: list[bytes], regressor: Path) -> None:
-    local = InProcess(LocalEngine.load(None, "cpu", Path("none")))
+    local = InProcessClient(LocalEngine.load(None, "cpu", Path("none")))
     assert len(local.detect(drive[0]).lanes) >= 2
     with pytest.raises(NoDetectorError, match="ask for candidates"):
         local.detect(drive[0], detector="regression")

@@ -1,4 +1,4 @@
-"""Where frames come from, and what is said where none do."""
+"""Reading frames from files, folders and cameras, and the errors of sources that can't be read."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ import pytest
 from lanestream.errors import ImageError, SourceError
 from lanestream.images.header import read_header
 from lanestream_client.frames import SourceFrame
-from lanestream_client.live import NewestFrames
 from lanestream_client.sinks import video_sink
-from lanestream_client.sources import open_source
+from lanestream_client.sources import NewestFrames, open_source
 
 
-def video(path: Path, times: list[float], size: tuple[int, int] = (64, 48)) -> str:
+def write_video(path: Path, times: list[float], size: tuple[int, int] = (64, 48)) -> str:
     with video_sink(path, 25.0) as sink:
         assert sink is not None
         for number, time in enumerate(times):
@@ -28,9 +27,9 @@ def video(path: Path, times: list[float], size: tuple[int, int] = (64, 48)) -> s
     return str(path)
 
 
-def test_a_video_has_its_own_times(tmp_path: Path) -> None:
+def test_frames_of_a_video_have_its_timestamps(tmp_path: Path) -> None:
     times = [0.0, 0.04, 0.12, 0.2]
-    with open_source(video(tmp_path / "a.mp4", times)) as source:
+    with open_source(write_video(tmp_path / "a.mp4", times)) as source:
         frames = list(source.frames)
         assert (source.live, source.length) == (False, 4)
     assert [frame.seq for frame in frames] == [0, 1, 2, 3]
@@ -39,7 +38,7 @@ def test_a_video_has_its_own_times(tmp_path: Path) -> None:
     assert read_header(frames[0].encoded()).kind == "JPEG"
 
 
-def test_a_folder_is_in_natural_order_and_sent_as_it_is(tmp_path: Path) -> None:
+def test_a_folder_is_read_in_natural_order_and_its_files_are_not_reencoded(tmp_path: Path) -> None:
     for name in ("img10.JPG", "img9.png", "img9a.webp", "notes.txt"):
         (tmp_path / name).write_bytes(
             fakes.image_file(f".{name[-3:].lower().replace('ebp', 'webp')}") if name[0] == "i" else b""
@@ -59,45 +58,47 @@ def test_one_image_is_a_source(tmp_path: Path) -> None:
         assert [frame.name for frame in source.frames] == ["a.png"]
 
 
-def test_what_is_no_source_is_told(tmp_path: Path) -> None:
+def test_an_invalid_source_is_reported(tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("text")
     (tmp_path / "empty").mkdir()
-    for spec, said in (
+    for spec, message in (
         ("none.mp4", "no such file"),
         ("text.mp4", "can't open"),
-        ("empty", "no image in the folder"),
+        ("empty", "no images in the folder"),
     ):
-        with pytest.raises(SourceError, match=said), open_source(str(tmp_path / spec)):
+        with pytest.raises(SourceError, match=message), open_source(str(tmp_path / spec)):
             pass
 
 
-def test_a_camera_that_is_not_there_is_told() -> None:
-    with pytest.raises(SourceError, match="no camera 97"), open_source("97"):
+def test_a_missing_camera_is_reported() -> None:
+    with pytest.raises(SourceError, match="camera 97 was not found"), open_source("97"):
         pass
 
 
-def test_sound_alone_is_no_source(tmp_path: Path) -> None:
+def test_a_file_with_sound_only_is_refused(tmp_path: Path) -> None:
     path = str(tmp_path / "sound.wav")
     with av.open(path, "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
-    with pytest.raises(SourceError, match="no video in it"), open_source(path):
+    with pytest.raises(SourceError, match="has no video stream"), open_source(path):
         pass
 
 
-def test_a_video_that_is_cut_short_gives_what_it_has(tmp_path: Path) -> None:
-    whole = Path(video(tmp_path / "a.mp4", [0.04 * number for number in range(40)], (320, 180)))
-    (tmp_path / "cut.mp4").write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+def test_a_truncated_video_is_read_up_to_its_end(tmp_path: Path) -> None:
+    complete = Path(write_video(tmp_path / "a.mp4", [0.04 * number for number in range(40)], (320, 180)))
+    (tmp_path / "cut.mp4").write_bytes(complete.read_bytes()[: complete.stat().st_size * 2 // 3])
     with open_source(str(tmp_path / "cut.mp4")) as source:
         assert 0 < len(list(source.frames)) < 40
 
 
-def test_a_stream_that_breaks_off_says_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    place = video(tmp_path / "a.mp4", [0.0, 0.04, 0.08])
+def test_a_network_stream_that_fails_says_after_how_many_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_video(tmp_path / "a.mp4", [0.0, 0.04, 0.08])
 
-    class Breaking:
+    class FailingContainer:
         def __init__(self, container: av.container.InputContainer) -> None:
             self.streams, self.duration, self._container = container.streams, None, container
 
@@ -109,46 +110,46 @@ def test_a_stream_that_breaks_off_says_where(tmp_path: Path, monkeypatch: pytest
 
         def decode(self, video: int) -> Iterator[av.VideoFrame]:
             yield from self._container.decode(video=video)
-            raise av.error.InvalidDataError(1, "no more of it")
+            raise av.error.InvalidDataError(1, "broken data")
 
-    whole = av.open
-    monkeypatch.setattr(av, "open", lambda _, **__: Breaking(whole(place)))
-    with open_source("rtsp://user:word@camera/1") as source:
+    open_container = av.open
+    monkeypatch.setattr(av, "open", lambda _, **__: FailingContainer(open_container(path)))
+    with open_source("rtsp://user:password@camera/1") as source:
         assert source.live
         assert [next(source.frames).seq for _ in range(3)] == [0, 1, 2]
-        with pytest.raises(SourceError, match=r"^rtsp://camera/1 breaks off after 3 frames: no more of it"):
+        with pytest.raises(SourceError, match=r"^rtsp://camera/1 failed after 3 frames: broken data"):
             next(source.frames)
 
 
-def test_a_frame_that_is_no_image_can_not_be_drawn_on() -> None:
+def test_a_frame_that_is_not_an_image_has_no_pixels() -> None:
     with pytest.raises(ImageError, match=r"a\.jpg can't be decoded"):
         SourceFrame(0, None, data=b"x", name="a.jpg").image()
 
 
-def test_a_live_source_gives_its_newest_frame() -> None:
-    more = [threading.Event(), threading.Event()]
-    given = threading.Event()
+def test_a_live_source_yields_its_newest_frame() -> None:
+    proceed = [threading.Event(), threading.Event()]
+    delivered = threading.Event()
 
     def camera() -> Iterator[SourceFrame]:
         yield SourceFrame(0, 0.0)
-        assert more[0].wait(fakes.WAIT_S)
+        assert proceed[0].wait(fakes.WAIT_S)
         for seq in (1, 2, 3):
             yield SourceFrame(seq, 0.0)
-        given.set()
-        assert more[1].wait(fakes.WAIT_S)
-        raise SourceError("the cable is out")
+        delivered.set()
+        assert proceed[1].wait(fakes.WAIT_S)
+        raise SourceError("the cable is unplugged")
 
     with NewestFrames(camera()) as newest:
         assert next(newest).seq == 0
-        more[0].set()
-        assert given.wait(fakes.WAIT_S)
+        proceed[0].set()
+        assert delivered.wait(fakes.WAIT_S)
         assert next(newest).seq == 3
         assert newest.skipped == 2
-        more[1].set()
+        proceed[1].set()
         with pytest.raises(SourceError, match="cable"):
             next(newest)
 
 
-def test_a_live_source_that_ends_ends() -> None:
+def test_iteration_ends_with_a_live_source() -> None:
     with NewestFrames(iter([SourceFrame(0, 0.0)])) as newest:
         assert [frame.seq for frame in newest] == [0]

@@ -1,0 +1,42 @@
+"""Lists the commands of this package for `lanestream`, which finds the list by its entry point.
+
+It is data only, so that `lanestream --help` imports no command and works without any extra.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
+    "scene": {
+        "target": "lanestream_exporter.scene_commands:scene",
+        "extra": "video",
+        "help": "Render a clip of a road with exact labels.",
+    },
+    "data": {
+        "target": "lanestream_exporter.data_commands:data",
+        "extra": "export",
+        "help": "Inspect and prepare labeled frames.",
+    },
+    "train": {
+        "target": "lanestream_exporter.training_commands:train",
+        "extra": "train,service,cpu",
+        "help": "Train a network.",
+    },
+    "export": {
+        "target": "lanestream_exporter.export_commands:export",
+        "extra": "export,service,cpu",
+        "help": "Convert a checkpoint to a model file.",
+    },
+    "evaluate": {
+        "target": "lanestream_exporter.evaluation_commands:evaluate",
+        "extra": "export,service,cpu",
+        "help": "Measure a model's accuracy.",
+    },
+    "score": {
+        "target": "lanestream_exporter.evaluation_commands:score",
+        "extra": "export,service,cpu",
+        "help": "Measure a stream's results against labels.",
+    },
+}
