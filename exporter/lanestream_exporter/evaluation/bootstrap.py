@@ -42,7 +42,9 @@ def blocks(frames: Sequence[LabelledFrame]) -> NDArray[np.int64]:
     return result
 
 
-def measured(counts: FloatArray, frames: Sequence[LabelledFrame], figures: FigureFunction) -> dict[str, float | None]:
+def point_estimates(
+    counts: FloatArray, frames: Sequence[LabelledFrame], figures: FigureFunction
+) -> dict[str, float | None]:
     """Returns the figures over all frames; `counts` is (N, C). A figure without data is None."""
     total = counts.sum(axis=0, keepdims=True) if len(frames) else np.zeros((1, counts.shape[1]))
     return {name: _number(float(value[0])) for name, value in figures(total).items()}

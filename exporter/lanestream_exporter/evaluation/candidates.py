@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score
 
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
+from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, RULES, FrameOutcome, JudgedCandidates
 from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE
 
@@ -52,7 +52,7 @@ def _judged(
         **{name: int((verdicts == value).sum()) for name, value in names.items()},
         "confusion": dict(zip(("tp", "fp", "fn", "tn"), map(int, counts.sum(axis=0)), strict=True)),
         "base_rate": round(float(truth.mean()), 4) if len(truth) else None,
-        **measured(counts, frames, _rates),
+        **point_estimates(counts, frames, _rates),
         "average_precision": round(float(average_precision_score(truth, probability)), 4) if both else None,
         "calibration": _calibration(truth, probability),
         "intervals": intervals(counts, frames, _rates),
@@ -107,7 +107,7 @@ def _proposed(outcomes: Sequence[FrameOutcome], ego: bool) -> dict[str, Any]:
         "labels": int(total[-1]),
         "found": [int(n) for n in total[:-1]],
         "recall": [round(float(n / total[-1]), 4) if total[-1] else None for n in total[:-1]],
-        **measured(counts, frames, _recalls),
+        **point_estimates(counts, frames, _recalls),
         "intervals": intervals(counts, frames, _recalls),
     }
 

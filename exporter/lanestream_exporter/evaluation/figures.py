@@ -10,7 +10,7 @@ import numpy as np
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.benchmarks import culane_frame, tusimple_frame
-from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
+from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.boundaries import FrameMatches, errors_along, match, match_ego
 from lanestream_exporter.evaluation.outcomes import FrameOutcome, ego_pair
 
@@ -49,7 +49,7 @@ def _matched(outcomes: Sequence[FrameOutcome], matched: Sequence[FrameMatches]) 
         "wrong": wrong,
         "missed": missed,
         "absent": absent,
-        **measured(counts, _frames(outcomes), _boundary_rates),
+        **point_estimates(counts, _frames(outcomes), _boundary_rates),
         "median_error_px_640": round(float(np.median(errors)), 4) if errors else None,
         "error_by_depth": _by_depth(outcomes, matched),
         "intervals": intervals(counts, _frames(outcomes), _boundary_rates),
@@ -94,7 +94,7 @@ def _tusimple(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
     return {
         "frames": len(outcomes),
         "labels": sum(len(outcome.frame.lanes) for outcome in outcomes),
-        **measured(counts, _frames(outcomes), _tusimple_means),
+        **point_estimates(counts, _frames(outcomes), _tusimple_means),
         "intervals": intervals(counts, _frames(outcomes), _tusimple_means),
     }
 
@@ -118,7 +118,7 @@ def _culane(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
         "tp": tp,
         "fp": fp,
         "fn": fn,
-        **measured(counts, _frames(outcomes), _culane_rates),
+        **point_estimates(counts, _frames(outcomes), _culane_rates),
         "intervals": intervals(counts, _frames(outcomes), _culane_rates),
     }
 

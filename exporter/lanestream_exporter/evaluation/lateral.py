@@ -17,7 +17,7 @@ import numpy as np
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.horizons import shared_horizon
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
+from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.boundaries import ego_sides
 from lanestream_exporter.evaluation.outcomes import FrameOutcome
 from lanestream_exporter.samples.patches import columns_at
@@ -66,7 +66,7 @@ def _figures(values: FloatArray, frames: Sequence[LabelledFrame], meters: float)
         "labeled": int((~np.isnan(label)).sum()),
         "reported": int(both.sum()),
         "reached": int((both & (top <= row)).sum()),
-        **measured(counts, frames, rates),
+        **point_estimates(counts, frames, rates),
         "intervals": intervals(counts, frames, rates),
     }
 

@@ -11,7 +11,7 @@ from lanestream.road.curve import FloatArray
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, match_ego
 from lanestream_exporter.evaluation.outcomes import FrameOutcome
 
-# The rows, as shares of the height, at which jitter is measured; they show road with any usual camera.
+# The rows, as shares of the height, at which jitter is measured; they show road with any typical camera.
 _ROWS = np.array([0.7, 0.8, 0.9])
 
 

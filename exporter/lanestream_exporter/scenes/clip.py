@@ -154,13 +154,13 @@ def _without_collisions(clip: Clip) -> tuple[Vehicle, ...]:
     times = np.arange(0.0, clip.frames / clip.fps + 0.2, 0.2)
     lateral = clip.scene.pose.u + np.array([clip.motion.lateral(float(time)) for time in times])
     along = clip.scene.pose.s + clip.motion.speed * times
-    kept = []
+    remaining = []
     for vehicle in clip.scene.traffic:
         gap = vehicle.s + vehicle.speed * times - along
         same_lane = np.abs(vehicle.u - lateral) < 2.4
         if not np.any(same_lane & (gap < MIN_GAP) & (gap > -vehicle.length - MIN_GAP)):
-            kept.append(vehicle)
-    return tuple(kept)
+            remaining.append(vehicle)
+    return tuple(remaining)
 
 
 def render_clip(clip: Clip) -> Iterator[RenderedFrame]:

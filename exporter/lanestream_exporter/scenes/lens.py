@@ -116,8 +116,8 @@ def _blur(image: Image, lens: Lens) -> Image:
         kernel = np.zeros((size, size), np.float32)
         angle = np.radians(lens.shake_angle)
         tip = np.array([np.cos(angle), np.sin(angle)]) * length / 2.0
-        middle = (size - 1) / 2.0
-        ends = np.round((middle + np.stack([-tip, tip])) * 16).astype(int)
+        center = (size - 1) / 2.0
+        ends = np.round((center + np.stack([-tip, tip])) * 16).astype(int)
         cv2.line(kernel, ends[0].tolist(), ends[1].tolist(), (1.0,), 1, cv2.LINE_8, 4)
         kernel += kernel[::-1, ::-1]  # symmetric, so that the image does not shift
         image = np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()), dtype=np.uint8)

@@ -196,10 +196,10 @@ def stencil_mask(text: str) -> Float32Array:
     else:
         scale, thickness = 3.0, 14
         (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
-        word = np.zeros((height + thickness, width + thickness), np.uint8)
+        raster = np.zeros((height + thickness, width + thickness), np.uint8)
         origin = (thickness // 2, height + thickness // 2)
-        cv2.putText(word, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness, cv2.LINE_AA)
-        cv2.resize(word, (size, size), mask, interpolation=cv2.INTER_AREA)
+        cv2.putText(raster, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness, cv2.LINE_AA)
+        cv2.resize(raster, (size, size), mask, interpolation=cv2.INTER_AREA)
     return np.asarray(mask, dtype=np.float32) / np.float32(255.0)
 
 

@@ -74,7 +74,7 @@ def _folded(values: Float32Array) -> Float32Array:
 
 
 def ground_noise(tile: Float32Array, grid: GroundGrid, cell: tuple[float, float], seed: int) -> Float32Array:
-    """Returns noise over the whole ground, faded out where a pixel covers more than a few texels to avoid flicker."""
+    """Returns noise over the entire ground, faded out where a pixel covers more than a few texels to avoid flicker."""
     values = sample_noise(tile, grid.u, grid.s, cell, seed)
     size = np.maximum(grid.x / np.float32(grid.projection.camera.focal) / cell[0], grid.along / cell[1])
     values *= np.minimum(1.0, 2.0 / np.maximum(size, 1e-3))[:, None].astype(np.float32)

@@ -229,8 +229,8 @@ def pulse(s: Float32Array, period: float, length: float, footprint: Float32Array
     """Returns the share of each pixel covered by marks of `length` every `period` meters, the first at s = 0."""
 
     def filled(position: Float32Array) -> Float32Array:
-        whole = np.floor(position / period)
-        return np.asarray(whole * length + np.minimum(position - whole * period, length), dtype=np.float32)
+        periods = np.floor(position / period)
+        return np.asarray(periods * length + np.minimum(position - periods * period, length), dtype=np.float32)
 
     box = np.maximum(footprint, np.float32(0.02))
     half = box * np.float32(0.5)

@@ -151,5 +151,5 @@ def _visible(scene: Scene, hidden: Image, points: FloatArray) -> FloatArray:
     if scene.lens.hood:
         above = rows < scene.lens.hood.top(width, height)[columns] - 1.0
         points, columns, rows = points[above], columns[above], rows[above]
-    seen = np.flatnonzero(hidden[rows, columns] == 0)
-    return points[: seen[-1] + 1] if len(seen) else points[:0]
+    visible = np.flatnonzero(hidden[rows, columns] == 0)
+    return points[: visible[-1] + 1] if len(visible) else points[:0]

@@ -176,15 +176,14 @@ def _lay_repairs(grid: GroundGrid, surface: Surface, gain: Float32Array) -> None
         if not grid.projection.overlaps(repair.s, repair.s + repair.length):
             continue
         band = grid.band(repair.low, repair.high)
-        middle = np.float32(repair.s + repair.length / 2.0)
-        inside = coverage(band.s - middle, repair.length, band.along)
-        center = np.float32((repair.low + repair.high) / 2.0)
-        sideways = coverage(band.u - center, repair.high - repair.low, band.across)
-        inside *= sideways
+        center_s = np.float32(repair.s + repair.length / 2.0)
+        inside = coverage(band.s - center_s, repair.length, band.along)
+        center_u = np.float32((repair.low + repair.high) / 2.0)
+        inside *= coverage(band.u - center_u, repair.high - repair.low, band.across)
         flat[band.index] *= 1.0 + np.float32(repair.gain - 1.0) * inside
         if repair.rim > 0.0:
-            core = coverage(band.s - middle, repair.length - 0.08, band.along)
-            core *= coverage(band.u - center, repair.high - repair.low - 0.08, band.across)
+            core = coverage(band.s - center_s, repair.length - 0.08, band.along)
+            core *= coverage(band.u - center_u, repair.high - repair.low - 0.08, band.across)
             flat[band.index] *= 1.0 - np.float32(repair.rim) * (inside - core)
 
 

@@ -19,7 +19,7 @@ from lanestream_exporter.evaluation.benchmarks import (
     tusimple_frame,
     tusimple_score,
 )
-from lanestream_exporter.evaluation.bootstrap import blocks, intervals, measured, ratio
+from lanestream_exporter.evaluation.bootstrap import blocks, intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, match, match_ego
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
@@ -319,7 +319,7 @@ def test_intervals_are_reproducible_and_depend_on_the_blocks() -> None:
     alternating = np.array([[i % 2, 1.0] for i in range(200)])
     grouped = np.array([[(i // 5) % 2, 1.0] for i in range(200)])
     assert intervals(grouped, frames, rates) == intervals(grouped, frames, rates)
-    assert measured(grouped, frames, rates) == {"share": 0.5}
+    assert point_estimates(grouped, frames, rates) == {"share": 0.5}
     wide, narrow = intervals(grouped, frames, rates)["share"], intervals(alternating, frames, rates)["share"]
     assert wide is not None
     assert narrow is not None

@@ -87,10 +87,10 @@ def test_the_classifier_file_matches_pytorch_at_any_batch_size(classifier: Expor
     inputs = classifier.validation.inputs[:20]
     expected = in_batches(classifier.report.network.serving_module(), inputs).numpy()
     assert expected[:, 1].std() > 0.02
-    whole = model.run(inputs)
-    np.testing.assert_allclose(whole.sum(axis=1), 1.0, atol=1e-5)
-    assert np.abs(whole - expected).mean() < 0.3 * expected[:, 1].std()
-    np.testing.assert_allclose(np.concatenate([model.run(p[None]) for p in inputs[:5]]), whole[:5], atol=1e-4)
+    outputs = model.run(inputs)
+    np.testing.assert_allclose(outputs.sum(axis=1), 1.0, atol=1e-5)
+    assert np.abs(outputs - expected).mean() < 0.3 * expected[:, 1].std()
+    np.testing.assert_allclose(np.concatenate([model.run(p[None]) for p in inputs[:5]]), outputs[:5], atol=1e-4)
     assert model.run(inputs[:0]).shape == (0, 2)
 
 
