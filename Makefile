@@ -52,9 +52,9 @@ models: $(DEV_READY)
 	$(BIN)/lanestream train classifier --run runs/classifier
 	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
 	$(BIN)/lanestream train classifier classifier-third --run runs/classifier-third
-	$(BIN)/lanestream export runs/classifier-third/best.pt out/classifier.onnx --guide out/regressor.onnx
+	$(BIN)/lanestream export runs/classifier-third/best.pt out/classifier.onnx --regressor out/regressor.onnx
 	$(BIN)/lanestream export runs/classifier-third/best.pt out/classifier-fp32.onnx --precision fp32 \
-	  --guide out/regressor.onnx
+	  --regressor out/regressor.onnx
 
 evaluate: $(DEV_READY)
 	$(BIN)/lanestream evaluate --split test --model $(MODELS)/classifier.onnx --model $(MODELS)/regressor.onnx \

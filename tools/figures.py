@@ -116,7 +116,7 @@ def _lateral(groups: Groups) -> list[str]:
     for place in ("10m", "30m"):
         part = groups["lateral"][place]
         cells += [
-            f"{_pixels(part['mean_px_640'])} ({part['told']} of {part['labelled']})",
+            f"{_pixels(part['mean_px_640'])} ({part['reported']} of {part['labeled']})",
             f"{_share(part['ratio'])}{_interval(part, 'ratio')}",
         ]
     far = groups["lateral"]["30m"]

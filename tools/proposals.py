@@ -17,7 +17,7 @@ from lanestream.detection.proposals import CandidateSearch
 from lanestream.engine import load_engine
 from lanestream.errors import LanestreamError
 from lanestream_exporter.datasets.splits import Split, data_root, real_frames
-from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, Proposed, judge
+from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, LabelProposal, judge
 
 COUNTS = (4, 8, 12, 16, 24, 32)
 
@@ -46,7 +46,7 @@ def main(split: Split, path: Path) -> None:
     told: dict[str, dict[str, dict[str, object]]] = {}
     for name, search, glance in steps():
         detector = CandidateDetector(search=search)
-        proposed: dict[str, list[Proposed]] = {}
+        proposed: dict[str, list[LabelProposal]] = {}
         for frame, image in frames:
             prior = None if glance is None else answered(glance.look(image))
             prepared = detector.prepare(image, prior=prior)
@@ -62,9 +62,9 @@ def main(split: Split, path: Path) -> None:
     path.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
 
 
-def recall(labels: list[Proposed], ego: bool) -> dict[str, object]:
+def recall(labels: list[LabelProposal], ego: bool) -> dict[str, object]:
     """Counts and shares of the labels that the first N candidates hold."""
-    places = [label.place for label in labels if label.ego or not ego]
+    places = [label.rank for label in labels if label.ego or not ego]
     found = {n: sum(place is not None and place < n for place in places) for n in COUNTS}
     return {"labels": len(places), "found": found, "recall": {n: round(k / len(places), 4) for n, k in found.items()}}
 

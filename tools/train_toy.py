@@ -37,7 +37,17 @@ def main(folder: Path) -> None:
     lanestream("data", "check", folder / "learn", "--against", folder / "test", "--sheet", folder / "sheet.jpg")
     lanestream("train", "classifier", config, "--run", run)
     lanestream(
-        "export", run / "best.pt", model, "--guide", "none", "--precision", "fp32", "--scenes", "4", "--tolerance", "5"
+        "export",
+        run / "best.pt",
+        model,
+        "--regressor",
+        "none",
+        "--precision",
+        "fp32",
+        "--scenes",
+        "4",
+        "--tolerance",
+        "5",
     )
     report = folder / "evaluation.json"
     lanestream("evaluate", "--model", model, "--regressor", "none", "--data", folder / "test", "--json", report)

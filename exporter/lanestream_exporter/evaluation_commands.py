@@ -17,10 +17,10 @@ from lanestream_exporter.datasets.folder import DataFolder
 from lanestream_exporter.datasets.formats import FORMATS
 from lanestream_exporter.datasets.reading import form_of, read_dataset
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.evaluation.baselines import HoughLinesPeer, SlidingWindowPeer
+from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
 from lanestream_exporter.evaluation.measuring import Material
 from lanestream_exporter.evaluation.measuring import evaluate as measure
-from lanestream_exporter.evaluation.methods import Method, Model, Peer
+from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
 from lanestream_exporter.evaluation.score import score as measured
 from lanestream_exporter.evaluation.tables import tables
 
@@ -61,7 +61,7 @@ def evaluate(
     data: Path | None,
     form: str,
 ) -> None:
-    """Measure model files and two classical peers on labelled frames.
+    """Measure model files and two classical baselines on labelled frames.
 
     Candidates (level A), boundaries of single images and of clips (B), and the field's metrics (C); docs/evaluation.md
     describes every figure. Your own frames are measured as single images, all of them.
@@ -114,8 +114,8 @@ def _writing(path: Path) -> Iterator[None]:
 
 def _methods(models: Sequence[Path], regressor: Path | None) -> list[Method]:
     guide = resolve_regressor(regressor)
-    ours = [Model(load_engine(path, "cpu", guide)) for path in models]
-    methods: list[Method] = [*ours, Peer(HoughLinesPeer()), Peer(SlidingWindowPeer())]
+    ours = [ServedModel(load_engine(path, "cpu", guide)) for path in models]
+    methods: list[Method] = [*ours, Baseline(HoughLinesBaseline()), Baseline(SlidingWindowBaseline())]
     names = [method.name for method in methods]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

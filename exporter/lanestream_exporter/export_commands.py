@@ -16,34 +16,34 @@ from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
 from lanestream_exporter.alexnet import FULL
 from lanestream_exporter.datasets.splits import data_root
-from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
-from lanestream_exporter.exporting.classifier import ClassifierSubject
+from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
+from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
-from lanestream_exporter.exporting.frames import FrameSource
-from lanestream_exporter.exporting.normalisation import NORMALISATIONS
-from lanestream_exporter.exporting.proof import Measured
-from lanestream_exporter.exporting.subject import Precision, Subject
+from lanestream_exporter.exporting.exportable import ExportableNetwork, Precision
+from lanestream_exporter.exporting.frames import ExportFrames
+from lanestream_exporter.exporting.graph import NORMALIZATIONS
+from lanestream_exporter.exporting.proof import ModelMeasurement
 from lanestream_exporter.samples.prior_regressor import prior_estimator
 from lanestream_exporter.training.config import PatchData
 
-_STRIP = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
+_PATCH_KEYS = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
 
 
 def _classes(_context: click.Context, _option: click.Parameter, value: str | None) -> tuple[str, ...] | None:
     return None if value is None else tuple(name.strip() for name in value.split(","))
 
 
-def _strip(_context: click.Context, _option: click.Parameter, value: str | None) -> PatchGeometry | None:
-    """The strip geometry in `size=224,half_width=0.5,min_half_width=5`; what isn't named has its usual value."""
+def _patch_geometry(_context: click.Context, _option: click.Parameter, value: str | None) -> PatchGeometry | None:
+    """Parses `size=224,half_width=0.5,min_half_width=5`; keys that are not given have their defaults."""
     if value is None:
         return None
     given: dict[str, Any] = {"size": FULL.size}
     for part in filter(None, value.split(",")):
-        key, _, number = (word.strip() for word in part.partition("="))
-        if key not in _STRIP:
-            raise click.BadParameter(f"there is no {key!r}; accepted: {', '.join(_STRIP)}")
+        key, _, number = (text.strip() for text in part.partition("="))
+        if key not in _PATCH_KEYS:
+            raise click.BadParameter(f"unknown key {key!r}; accepted: {', '.join(_PATCH_KEYS)}")
         try:
-            given[key] = _STRIP[key](number)
+            given[key] = _PATCH_KEYS[key](number)
         except ValueError:
             raise click.BadParameter(f"{key} must be a number, not {number!r}") from None
         if not (0 < given[key] < math.inf or (key == "lean" and given[key] == 0)):
@@ -59,8 +59,8 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
 )
 @click.option(
     "--rank-energy", type=click.FloatRange(0.5, 1.0),
-    help="Share of the hidden layers' variance to keep; 1 keeps the layers as they are."
-    "  [default: 0.998 of a classifier's, 0.9999 of a regressor's]",
+    help="Share of the hidden layers' variance to keep; 1 keeps the layers unchanged."
+    "  [default: 0.998 for a classifier, 0.99996 for a regressor]",
 )  # fmt: skip
 @click.option(
     "--tolerance", type=click.FloatRange(0.0, 100.0), default=ExportSettings.tolerance, show_default=True,
@@ -68,54 +68,55 @@ def _strip(_context: click.Context, _option: click.Parameter, value: str | None)
 )  # fmt: skip
 @click.option(
     "--data", type=click.Path(path_type=Path), envvar="LANESTREAM_DATA", show_envvar=True,
-    help="Folder of real frames; without it rendered scenes alone are used. What was trained on frames of your own is"
-    " proved on those.",
+    help="Folder of real frames; without it only rendered scenes are used. A network trained on frames of your own is"
+    " verified on those.",
 )  # fmt: skip
 @click.option(
-    "--scenes", type=click.IntRange(4), default=FrameSource.rendered, show_default=True,
-    help="Rendered scenes to calibrate with, and as many to prove the file with.",
+    "--scenes", type=click.IntRange(4), default=ExportFrames.rendered, show_default=True,
+    help="Number of rendered scenes for calibration, and again for verification.",
 )  # fmt: skip
 @click.option(
-    "--guide", type=click.Path(path_type=Path), metavar="FILE",
-    help="Of a classifier: the regressor that it will be served with, or `none`  [default: the shipped one].",
+    "--regressor", type=click.Path(path_type=Path), metavar="FILE",
+    help="For a classifier: the regressor that it will be served with, or `none`  [default: the shipped one].",
 )  # fmt: skip
-@click.option("--name", help="What the model is called  [default: by its kind]")
-@click.option("--classes", callback=_classes, help="Of a torchvision AlexNet: its classes in order, say false,lane.")
+@click.option("--name", help="Name of the model  [default: by its kind]")
+@click.option("--classes", callback=_classes, help="For a torchvision AlexNet: its classes in order, e.g. false,lane.")
 @click.option(
-    "--strip", callback=_strip, help="Of a torchvision AlexNet: its strips, size=224,half_width=0.5,min_half_width=5."
-)
+    "--patch", callback=_patch_geometry,
+    help="For a torchvision AlexNet: the geometry of its patches, e.g. size=224,half_width=0.5,min_half_width=5.",
+)  # fmt: skip
 @click.option(
-    "--normalisation", type=click.Choice(list(NORMALISATIONS)), default=Foreign.normalisation, show_default=True,
-    help="Of a torchvision AlexNet: how its training normalised pixels.",
+    "--normalization", type=click.Choice(list(NORMALIZATIONS)), default=ForeignNetwork.normalization, show_default=True,
+    help="For a torchvision AlexNet: the pixel normalization of its training.",
 )  # fmt: skip
 def export(checkpoint: Path, out: Path, **given: Any) -> None:
-    """Write CHECKPOINT as the ONNX file OUT that serves, after proving that it does the same."""
+    """Write CHECKPOINT as the ONNX file OUT for serving, after verifying that both give the same results."""
     if out.is_dir():
         raise ExportError(f"{out} is a folder", "give the path of the file to write")
-    foreign = _foreign(given["classes"], given["strip"], given["normalisation"])
-    # What is no checkpoint is told now, not after the frames have been made.
-    subject, training = read_subject(checkpoint, foreign)
-    subject = _guided(subject, given["guide"])
+    foreign = _foreign_network(given["classes"], given["patch"], given["normalization"])
+    # An invalid checkpoint must fail now, not after the frames have been prepared.
+    network, training = read_network(checkpoint, foreign)
+    network = _with_prior(network, given["regressor"])
     own = _own_frames(training)
     root = data_root(given["data"]) if given["data"] and own is None else None
-    source = FrameSource(root, rendered=given["scenes"], own=own)
-    energy = subject.rank_energy if given["rank_energy"] is None else given["rank_energy"]
-    settings = ExportSettings(given["name"] or subject.name, energy, given["precision"], given["tolerance"])
-    _tell(out, export_network(subject, out, settings, Provenance(training, source), click.echo), source)
+    frames = ExportFrames(root, rendered=given["scenes"], own=own)
+    energy = network.default_rank_energy if given["rank_energy"] is None else given["rank_energy"]
+    settings = ExportSettings(given["name"] or network.default_name, energy, given["precision"], given["tolerance"])
+    _print_report(out, export_network(network, out, settings, Provenance(training, frames), click.echo), frames)
 
 
-def _guided(subject: Subject, named: Path | None) -> Subject:
-    """A classifier as it is served, with the regressor that is `named`; a regressor as it is."""
-    if isinstance(subject, ClassifierSubject):
-        guide = resolve_regressor(named)
-        return subject if guide is None else replace(subject, glance=prior_estimator(guide))
-    if named is not None:
-        raise click.UsageError("a regressor has no guide: --guide is for classifiers")
-    return subject
+def _with_prior(network: ExportableNetwork, regressor: Path | None) -> ExportableNetwork:
+    """Returns a classifier with the prior of `regressor`, as it is served; returns a regressor unchanged."""
+    if isinstance(network, ExportableClassifier):
+        path = resolve_regressor(regressor)
+        return network if path is None else replace(network, prior_estimator=prior_estimator(path))
+    if regressor is not None:
+        raise click.UsageError("--regressor is only for classifiers; CHECKPOINT is a regressor")
+    return network
 
 
 def _own_frames(training: dict[str, Any]) -> PatchData | None:
-    """The labelled frames that a network was trained on, where they were somebody's own and are here."""
+    """Returns the user's own frames that the network was trained on; None if there were none or they are missing."""
     data = training.get("config", {}).get("data", {})
     paths = [frames["path"] for key in ("train", "validation") for frames in data.get(key, [])]
     if not paths or not all(Path(path).exists() for path in paths):
@@ -123,41 +124,43 @@ def _own_frames(training: dict[str, Any]) -> PatchData | None:
     return PatchData.model_validate({key: data[key] for key in ("train", "validation", "validation_share")})
 
 
-def _foreign(classes: tuple[str, ...] | None, strip: PatchGeometry | None, normalisation: str) -> Foreign | None:
-    if classes is None and strip is None:
+def _foreign_network(
+    classes: tuple[str, ...] | None, geometry: PatchGeometry | None, normalization: str
+) -> ForeignNetwork | None:
+    if classes is None and geometry is None:
         return None
-    if classes is None or strip is None:
-        raise click.UsageError("a torchvision AlexNet needs both --classes and --strip")
-    return Foreign(classes, strip, normalisation)
+    if classes is None or geometry is None:
+        raise click.UsageError("a torchvision AlexNet needs both --classes and --patch")
+    return ForeignNetwork(classes, geometry, normalization)
 
 
-def _tell(out: Path, report: ExportReport, source: FrameSource) -> None:
+def _print_report(out: Path, report: ExportReport, frames: ExportFrames) -> None:
     rows = [report.checkpoint, report.fp32, *([] if report.written is report.fp32 else [report.written])]
-    title = f"{report.inputs} inputs of {report.frames} validation frames: {source.origin}"
+    title = f"{report.inputs} inputs of {report.frames} validation frames: {frames.origin}"
     table = Table("", title=title, title_justify="left")
-    names = [name.replace("_", " ") for name in report.written.figures]
+    names = [name.replace("_", " ") for name in report.written.metrics]
     for heading in ("size", *names, "difference", "largest", "CPU"):
         table.add_column(heading, justify="right")
     for row in rows:
         table.add_row(*_cells(row))
     Console(width=140, highlight=False).print(table)
-    calibration, found = report.subject.calibration, report.boundaries
+    calibration, compared = report.network.calibration, report.boundaries
     click.echo(f"temperature {calibration.temperature:.3f}, threshold {calibration.threshold:.2f}")
     click.echo(
-        f"boundaries: {found.both} by PyTorch and by the file, {found.alone} by one alone; "
-        f"{found.mean:.3f} px apart on average, {found.largest:.2f} at most (of 640 wide)"
+        f"boundaries: {compared.matched} found by both PyTorch and the file, {compared.unmatched} by only one; "
+        f"distance {compared.mean:.3f} px on average, {compared.largest:.2f} px at most (at 640 px width)"
     )
-    for other, lost in report.lost.items():
-        click.echo(f"{report.written.name} against {other}: {lost:.2f} points of accuracy lost")
+    for reference, lost in report.lost.items():
+        click.echo(f"{report.written.name} against {reference}: {lost:.2f} points of accuracy lost")
     if report.time_ratio is not None:
-        ratio = f"{report.time_ratio:.2f} of the time ({report.timed_by})"
+        ratio = f"{report.time_ratio:.2f} of the time ({report.timing_provider})"
         click.echo(f"{report.written.name} against fp32, the same network: {ratio}")
     click.echo(f"{out}: {out.stat().st_size:,} bytes")
 
 
-def _cells(row: Measured) -> list[str]:
-    figures = [f"{value:.2f} px" if name.endswith("_px") else f"{value:.4f}" for name, value in row.figures.items()]
+def _cells(row: ModelMeasurement) -> list[str]:
+    metrics = [f"{value:.2f} px" if name.endswith("_px") else f"{value:.4f}" for name, value in row.metrics.items()]
     if row.size is None or row.milliseconds is None:
-        return [f"{row.name}, PyTorch", "", *figures, "", "", ""]
+        return [f"{row.name}, PyTorch", "", *metrics, "", "", ""]
     size, time = f"{row.size / 1e6:.1f} MB", f"{row.milliseconds:.2f} ms"
-    return [f"{row.name} file", size, *figures, f"{row.mean_difference:.1e}", f"{row.largest_difference:.1e}", time]
+    return [f"{row.name} file", size, *metrics, f"{row.mean_difference:.1e}", f"{row.largest_difference:.1e}", time]

@@ -1,4 +1,4 @@
-"""The command `scene`: a rendered clip of a road with its labels, to try things with."""
+"""The command `scene`: renders a clip of a road with its labels, for experiments."""
 
 from __future__ import annotations
 
@@ -15,32 +15,38 @@ from lanestream_exporter.scenes import Clip, Drive, sample_clip, write_clip
 
 
 class SizeType(click.ParamType[tuple[int, int]]):
-    """WIDTHxHEIGHT in pixels, both even, as video wants them."""
+    """A click type for WIDTHxHEIGHT in pixels, both even, as video encoders require."""
 
     name = "WIDTHxHEIGHT"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """The two numbers; fails with what is accepted."""
+        """Returns (width, height); fails with a message that says what is accepted."""
         try:
             width, height = (int(part) for part in str(value).lower().split("x"))
         except ValueError:
-            self.fail(f"{value!r} is no size; 1280x720 would be one", param, ctx)
+            self.fail(f"{value!r} is not a valid size; give WIDTHxHEIGHT, for example 1280x720", param, ctx)
         if not (320 <= width <= 3840 and 180 <= height <= 2160) or width % 2 or height % 2:
-            self.fail(f"{value!r} is refused; even numbers from 320x180 to 3840x2160 are accepted", param, ctx)
+            self.fail(f"{value!r} is not supported; give even numbers from 320x180 to 3840x2160", param, ctx)
         return width, height
 
 
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path, dir_okay=False), metavar="OUT.mp4")
-@click.option("--seed", type=click.IntRange(0), default=24, show_default=True, help="Another seed, another road.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=24,
+    show_default=True,
+    help="Seed of the random road.",
+)
 @click.option("--seconds", default=8.0, show_default=True, type=click.FloatRange(0.1, 600.0))
 @click.option("--fps", default=25.0, show_default=True, type=click.FloatRange(1.0, 120.0))
 @click.option("--size", default="1280x720", show_default=True, type=SizeType())
 @click.option(
     "--style", default="highway", show_default=True, type=click.Choice(["highway", "country", "street", "lane"])
 )
-@click.option("--any-weather", is_flag=True, help="Also night, rain, fog and dirt, as they come; else a clear day.")
-@click.option("--lane-change", is_flag=True, help="The camera changes lanes on the way.")
+@click.option("--any-weather", is_flag=True, help="Sample night, rain, fog and camera faults too, not only clear days.")
+@click.option("--lane-change", is_flag=True, help="Change lanes during the drive.")
 @click.option("--labels", type=click.Path(path_type=Path, dir_okay=False), help="Labels file  [default: OUT.jsonl]")
 def scene(
     out: Path,
@@ -53,7 +59,7 @@ def scene(
     lane_change: bool,
     labels: Path | None,
 ) -> None:
-    """Render a drive to the video OUT.mp4, with the exact labels of every frame."""
+    """Render a drive to the video OUT.mp4, with exact labels for every frame."""
     drive = Drive(style, lane_change=lane_change, fair=not any_weather)
     frames = max(1, round(seconds * fps))
     clip = sample_clip(np.random.default_rng(seed), *size, frames=frames, fps=fps, drive=drive)
@@ -63,7 +69,7 @@ def scene(
         _render(clip, out, labels)
     except OSError as error:
         raise SourceError(f"can't write {out}: {(error.strerror or str(error)).lower()}") from None
-    click.echo(f"{out}: {frames} frames of {size[0]} x {size[1]}, {fps:g} a second; labels in {labels}")
+    click.echo(f"{out}: {frames} frames of {size[0]} x {size[1]}, {fps:g} per second; labels in {labels}")
 
 
 def _render(clip: Clip, out: Path, labels: Path) -> None:

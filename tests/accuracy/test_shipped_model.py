@@ -9,7 +9,7 @@ import pytest
 from lanestream.engine import SHIPPED_MODEL, Engine, load_engine
 from lanestream_exporter.datasets.splits import highway_clip, real_frames
 from lanestream_exporter.evaluation.measuring import Material, evaluate
-from lanestream_exporter.evaluation.methods import Model
+from lanestream_exporter.evaluation.methods import ServedModel
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def test_the_shipped_files_are_small() -> None:
 
 def test_the_easy_clip_is_tracked_exactly(engine: Engine, data: Path) -> None:
     material = Material("easy", lambda: (), (highway_clip(data, "highway_white_right"),))
-    run = evaluate([Model(engine)], material).clips[engine.network.name]["highway_white_right"]
+    run = evaluate([ServedModel(engine)], material).clips[engine.network.name]["highway_white_right"]
     figures = run.figures()
     assert figures["steadiness"]["frames"] == 221
     assert figures["steadiness"]["both_ego"] >= 0.98
@@ -41,7 +41,7 @@ def test_the_easy_clip_is_tracked_exactly(engine: Engine, data: Path) -> None:
 def test_single_images_of_the_validation_split(engine: Engine, data: Path) -> None:
     """A floor, not a figure to be proud of: it catches a broken model file or a broken proposal stage."""
     material = Material("val", lambda: real_frames(data, "val"))
-    figures = evaluate([Model(engine)], material).figures()["images"][engine.network.name]["tusimple 0313-1"]
+    figures = evaluate([ServedModel(engine)], material).figures()["images"][engine.network.name]["tusimple 0313-1"]
     assert figures["candidates"]["proposal_recall"]["ego"]["recall_16"] >= 0.85
     assert figures["boundaries"]["ego"]["precision"] >= 0.85
     assert figures["boundaries"]["ego"]["recall"] >= 0.85

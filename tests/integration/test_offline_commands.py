@@ -64,7 +64,7 @@ def folder(tmp_path: Path) -> Path:
         ("data check none --sheet sheet.txt", "can't write a picture to sheet.txt"),
         ("data check none --format cvat", "no labelled frames in none as cvat"),
         ("score missing.jsonl half.jsonl", "can't read missing.jsonl"),
-        ("score text half.jsonl", "text:1 is no `lanes` message"),
+        ("score text half.jsonl", "text:1 is not a valid `lanes` message"),
         ("score binary half.jsonl", "binary is not a text file"),
         ("score empty.jsonl missing.jsonl", "can't read missing.jsonl"),
         ("score empty.jsonl text", "text:1: not JSON"),

@@ -1,15 +1,15 @@
-"""Boundaries against labels, frame by frame: who found what, and how exactly.
+"""Matching of reported boundaries to labels, frame by frame.
 
-A boundary is right where it lies, over at least half of a label's rows, within 15 pixels on average and 20 pixels in
-the median of it, at 640 pixels of width and measured across the line; each label counts once. The distances are those
-of M. Aly, "Real time detection of lane markers in urban streets", 2008; one-to-one matching and the overlap are
-stricter.
+A report is right if, over at least half of a label's rows, its distance across the line is at most 15 pixels on average
+and 20 pixels in the median, at 640 pixels of image width; each label matches at most one report. The distances are
+those of M. Aly, "Real time detection of lane markers in urban streets", 2008; one-to-one matching and the overlap make
+the rule stricter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -19,15 +19,16 @@ from lanestream.road.results import LaneBoundary
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
 from lanestream_exporter.samples.patches import columns_at
 
-_MEAN, _MEDIAN, _OVERLAP = 15.0, 20.0, 0.5
-_BOTTOM = 0.9722  # the row, as a share of the height, at which sides are told: row 700 of 720
+_MAX_MEAN, _MAX_MEDIAN, _MIN_OVERLAP = 15.0, 20.0, 0.5
+_SAMPLES = 64  # rows of a label at which distances are measured
+_SIDE_ROW = 0.9722  # the row, as a share of the height, that decides left or right: row 700 of 720
 
 
 @dataclass(frozen=True)
-class Found:
-    """A boundary that was reported: its curve, the rows it was reported for, its position, its identity if any.
+class ReportedBoundary:
+    """A boundary as a method reports it: its curve, the rows that it spans, its position and its track id, if any.
 
-    `farthest` is the row that it may be continued up to, where that is not almost its horizon.
+    `farthest` is the highest row that it may be extrapolated to; None allows extrapolation close to its horizon.
     """
 
     curve: Curve
@@ -38,163 +39,116 @@ class Found:
     farthest: float | None = None
 
     @classmethod
-    def of(cls, lane: LaneBoundary) -> Found:
-        """What a frame's result says of one boundary."""
+    def from_lane(cls, lane: LaneBoundary) -> ReportedBoundary:
+        """Returns the report of a boundary in a frame's result."""
         return cls(lane.curve, lane.top, lane.bottom, lane.position, lane.track_id)
 
-    def straight_on(self, rows: FloatArray) -> FloatArray:
-        """Columns at `rows`; above its `top` it goes on straight as it ends."""
-        beyond = np.minimum(rows - self.top, 0.0)
-        return np.asarray(self.curve.x(np.maximum(rows, self.top)) + self.curve.slope(self.top) * beyond)
+    def straight_columns(self, rows: FloatArray) -> FloatArray:
+        """Returns the columns at `rows`, extrapolated along a straight line above `top`."""
+        above = np.minimum(rows - self.top, 0.0)
+        return np.asarray(self.curve.x(np.maximum(rows, self.top)) + self.curve.slope(self.top) * above)
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A right boundary: its place among the found ones, its label, their mean distance in pixels at 640 wide."""
+class BoundaryMatch:
+    """A right report: its index among the reports, its label, and their mean distance in pixels at 640 wide."""
 
-    found: int
+    index: int
     label: LabelledLane
     error: float
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One frame: the right boundaries, how many were wrong and missed, and how many are absent and not reported."""
+class FrameMatches:
+    """The right reports of a frame, and the numbers of wrong reports, missed labels and rightly absent sides."""
 
-    pairs: tuple[Pair, ...]
+    matches: tuple[BoundaryMatch, ...]
     wrong: int
     missed: int
     absent: int = 0
 
 
-@dataclass
-class Tally:
-    """Counts over frames, and the errors in pixels of a 640 pixel wide image of all right boundaries."""
+def match(reports: Sequence[ReportedBoundary], labels: Sequence[LabelledLane], frame: LabelledFrame) -> FrameMatches:
+    """Matches reports to `labels` one to one.
 
-    right: int = 0
-    wrong: int = 0
-    missed: int = 0
-    errors: list[float] = field(default_factory=list)
-
-    def add(self, verdict: Verdict) -> None:
-        """Counts one frame."""
-        self.right += len(verdict.pairs)
-        self.wrong += verdict.wrong
-        self.missed += verdict.missed
-        self.errors += [pair.error for pair in verdict.pairs]
-
-    @property
-    def precision(self) -> float:
-        """Right ones among the reported; not a number where nothing was reported."""
-        return self.right / (self.right + self.wrong) if self.right + self.wrong else float("nan")
-
-    @property
-    def recall(self) -> float:
-        """Found ones among the labelled; not a number where nothing was labelled."""
-        return self.right / (self.right + self.missed) if self.right + self.missed else float("nan")
-
-    @property
-    def mean_error(self) -> float:
-        """Mean distance of the right ones, in pixels at 640 wide."""
-        return float(np.mean(self.errors)) if self.errors else float("nan")
-
-    def summary(self) -> dict[str, float | int | None]:
-        """All figures with their counts; null where there is nothing to divide by."""
-        figures = {
-            "precision": round(self.precision, 4),
-            "recall": round(self.recall, 4),
-            "mean_error_px_640": round(self.mean_error, 3),
-        }
-        counts = {"right": self.right, "wrong": self.wrong, "missed": self.missed}
-        return {**counts, **{name: None if np.isnan(value) else value for name, value in figures.items()}}
-
-
-def count(tally: Tally, found: Sequence[Found], labels: Sequence[LabelledLane], frame: LabelledFrame) -> None:
-    """Adds one frame to `tally`: the reported boundaries against `labels`, see `match`."""
-    tally.add(match(found, labels, frame))
-
-
-def match(found: Sequence[Found], labels: Sequence[LabelledLane], frame: LabelledFrame) -> Verdict:
-    """The reported boundaries against `labels`, each matched at most once.
-
-    A report beyond the outermost label of a side that is not wholly labelled is neither right nor wrong, unless it
-    repeats a label.
+    A report beyond the outermost label of a side that is not completely labeled is neither right nor wrong, unless it
+    duplicates a label.
     """
-    distances = np.array([[_distance(f, label, frame.width) for label in labels] for f in found])
-    chosen = _pairs(distances)
-    matched = {i for i, _ in chosen}
-    repeats = np.isfinite(distances).any(axis=1) if distances.size else np.zeros(len(found), bool)
-    unmatched = [i for i in range(len(found)) if i not in matched]
-    wrong = sum(1 for i in unmatched if repeats[i] or not _beyond_labels(found[i], frame))
-    pairs = tuple(Pair(i, labels[j], float(distances[i, j])) for i, j in chosen)
-    return Verdict(pairs, wrong, len(labels) - len(pairs))
+    distances = np.array([[_distance(report, label, frame.width) for label in labels] for report in reports])
+    pairs = _assign(distances)
+    matched = {i for i, _ in pairs}
+    duplicates = np.isfinite(distances).any(axis=1) if distances.size else np.zeros(len(reports), bool)
+    unmatched = [i for i in range(len(reports)) if i not in matched]
+    wrong = sum(1 for i in unmatched if duplicates[i] or not _beyond_labels(reports[i], frame))
+    matches = tuple(BoundaryMatch(i, labels[j], float(distances[i, j])) for i, j in pairs)
+    return FrameMatches(matches, wrong, len(labels) - len(matches))
 
 
-def match_ego(found: Sequence[Found], frame: LabelledFrame) -> Verdict:
-    """The reported ego boundaries against the labelled ones, side by side.
+def match_ego(reports: Sequence[ReportedBoundary], frame: LabelledFrame) -> FrameMatches:
+    """Matches the reported ego boundaries to the labeled ones, separately for each side.
 
-    What is reported for a side that has a label is right or wrong, wherever it lies. A side without label and without
-    report is rightly absent where the ego lane is wholly labelled.
+    A report for a side that has a label is right or wrong wherever it lies. A side without label and report is rightly
+    absent if the ego lane is completely labeled.
     """
-    pairs: list[Pair] = []
+    matches: list[BoundaryMatch] = []
     wrong = missed = absent = 0
     for side, label in zip((-1, 1), ego_sides(frame), strict=True):
-        reported = [i for i, f in enumerate(found) if f.position == side]
+        reported = [i for i, report in enumerate(reports) if report.position == side]
         if label is None:
-            wrong += sum(1 for i in reported if not _beyond_labels(found[i], frame))
+            wrong += sum(1 for i in reported if not _beyond_labels(reports[i], frame))
             absent += frame.coverage.ego and not reported
             continue
-        best = min(((_distance(found[i], label, frame.width), i) for i in reported), default=(np.inf, -1))
-        right = bool(np.isfinite(best[0]))
-        pairs += [Pair(best[1], label, float(best[0]))] if right else []
+        error, index = min(((_distance(reports[i], label, frame.width), i) for i in reported), default=(np.inf, -1))
+        right = bool(np.isfinite(error))
+        matches += [BoundaryMatch(index, label, float(error))] if right else []
         wrong += len(reported) - right
         missed += not right
-    return Verdict(tuple(pairs), wrong, missed, absent)
+    return FrameMatches(tuple(matches), wrong, missed, absent)
 
 
 def ego_labels(frame: LabelledFrame) -> list[LabelledLane]:
-    """The labels of the ego lane's boundaries that are there, left before right; see `ego_sides`."""
+    """Returns the labels of the ego lane's boundaries, left before right, without missing ones; see `ego_sides`."""
     return [label for label in ego_sides(frame) if label is not None]
 
 
 def ego_sides(frame: LabelledFrame) -> tuple[LabelledLane | None, LabelledLane | None]:
-    """The labels of the ego lane's (left, right) boundary: those named so, else the nearest ones beside the camera.
+    """Returns the labels of the ego lane's (left, right) boundary: by position, or else the nearest to the camera.
 
-    Without names a label is extended to the row at 97 % of the height by a line through its lower half.
+    A label without position is extrapolated to the row at 97 % of the height by a line through its lower half.
     """
     if any(lane.position is not None for lane in frame.lanes):
-        named = {lane.position: lane for lane in frame.lanes}
-        return named.get(-1), named.get(1)
-    at_bottom = [_extended(lane, _BOTTOM * frame.height) - 0.5 * frame.width for lane in frame.lanes]
+        by_position = {lane.position: lane for lane in frame.lanes}
+        return by_position.get(-1), by_position.get(1)
+    at_bottom = [_extrapolated(lane, _SIDE_ROW * frame.height) - 0.5 * frame.width for lane in frame.lanes]
     left = max(((x, i) for i, x in enumerate(at_bottom) if x < 0.0), default=None)
     right = min(((x, i) for i, x in enumerate(at_bottom) if x >= 0.0), default=None)
     return None if left is None else frame.lanes[left[1]], None if right is None else frame.lanes[right[1]]
 
 
-def errors_along(found: Found, label: LabelledLane, width: int) -> tuple[FloatArray, FloatArray]:
-    """(rows, distances) where both are: up to 64 rows, the distance across the line in pixels at 640 wide."""
-    rows = np.linspace(label.points[:, 1].min(), label.points[:, 1].max(), 64)
-    rows = rows[(rows >= found.top) & (rows <= found.bottom)]
-    across = np.abs(found.curve.x(rows) - columns_at(label, rows)) / np.hypot(1.0, found.curve.slope(rows))
+def errors_along(report: ReportedBoundary, label: LabelledLane, width: int) -> tuple[FloatArray, FloatArray]:
+    """Returns (rows, distances) where both exist: up to 64 rows, distances across the line in pixels at 640 wide."""
+    rows = np.linspace(label.points[:, 1].min(), label.points[:, 1].max(), _SAMPLES)
+    rows = rows[(rows >= report.top) & (rows <= report.bottom)]
+    across = np.abs(report.curve.x(rows) - columns_at(label, rows)) / np.hypot(1.0, report.curve.slope(rows))
     return rows, across * 640.0 / width
 
 
-def _extended(lane: LabelledLane, row: float) -> float:
+def _extrapolated(lane: LabelledLane, row: float) -> float:
     points = lane.points[np.argsort(-lane.points[:, 1])]
     lower = points[: max(4, len(points) // 2)]
     return float(np.polyval(np.polyfit(lower[:, 1], lower[:, 0], 1), row))
 
 
-def _distance(found: Found, label: LabelledLane, width: int) -> float:
-    """Mean distance in pixels at 640 wide; infinite where the rule is not kept."""
-    _, distance = errors_along(found, label, width)
-    if len(distance) < _OVERLAP * 64:
+def _distance(report: ReportedBoundary, label: LabelledLane, width: int) -> float:
+    """Returns the mean distance in pixels at 640 wide; infinity if the report does not match the label."""
+    _, distance = errors_along(report, label, width)
+    if len(distance) < _MIN_OVERLAP * _SAMPLES:
         return np.inf
-    keeps = distance.mean() <= _MEAN and np.median(distance) <= _MEDIAN
-    return float(distance.mean()) if keeps else np.inf
+    matches = distance.mean() <= _MAX_MEAN and np.median(distance) <= _MAX_MEDIAN
+    return float(distance.mean()) if matches else np.inf
 
 
-def _pairs(distances: FloatArray) -> list[tuple[int, int]]:
+def _assign(distances: FloatArray) -> list[tuple[int, int]]:
     if not distances.size:
         return []
     finite = np.isfinite(distances)
@@ -202,16 +156,16 @@ def _pairs(distances: FloatArray) -> list[tuple[int, int]]:
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if finite[i, j]]
 
 
-def _beyond_labels(found: Found, frame: LabelledFrame) -> bool:
-    """Whether half of it lies beside the outermost label of an open side, where there is a label to compare with."""
+def _beyond_labels(report: ReportedBoundary, frame: LabelledFrame) -> bool:
+    """Returns whether at least half of the report lies outside the outermost label of a side that is not complete."""
     if not frame.lanes:
         return False
-    rows = np.linspace(found.top, found.bottom, 16)
-    columns = found.curve.x(rows)
-    labelled = np.stack([columns_at(lane, rows) for lane in frame.lanes])
-    known = ~np.isnan(labelled).all(axis=0)
+    rows = np.linspace(report.top, report.bottom, 16)
+    columns = report.curve.x(rows)
+    labeled = np.stack([columns_at(lane, rows) for lane in frame.lanes])
+    known = ~np.isnan(labeled).all(axis=0)
     if not known.any():
         return frame.open_to(-1) or frame.open_to(1)
-    left, right = np.nanmin(labelled[:, known], axis=0), np.nanmax(labelled[:, known], axis=0)
-    beside = {-1: columns[known] <= left, 1: columns[known] >= right}
-    return any(frame.open_to(side) and share.mean() >= 0.5 for side, share in beside.items())
+    left, right = np.nanmin(labeled[:, known], axis=0), np.nanmax(labeled[:, known], axis=0)
+    outside = {-1: columns[known] <= left, 1: columns[known] >= right}
+    return any(frame.open_to(side) and beyond.mean() >= 0.5 for side, beyond in outside.items())

@@ -1,44 +1,48 @@
-"""Level A: the classifier on the candidates of its frames, and what was proposed at all."""
+"""Figures of level A: the classifier on the candidates of its frames, and proposal recall."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score
 
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
-from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, RULES, JudgedCandidates, Outcome
+from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
+from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, RULES, FrameOutcome, JudgedCandidates
 from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE
 
 _BINS = 10
-# Whose word is measured: the classifier's own, or what the detector decides by.
-_OWN, _DECIDED = "probabilities", "decided"
+# Fields of JudgedCandidates that can be evaluated: the classifier's probabilities, or those of the detector's decision.
+ProbabilityField = Literal["probabilities", "decided"]
 
 
-def candidate_figures(outcomes: Sequence[Outcome], threshold: float) -> dict[str, Any]:
-    """Every figure of level A under both rules for what is false; see docs/evaluation.md."""
+def candidate_figures(outcomes: Sequence[FrameOutcome], threshold: float) -> dict[str, Any]:
+    """Returns all figures of level A under both rules for false candidates; see docs/evaluation.md."""
     return {
         "threshold": threshold,
         **{rule: _judged(outcomes, rule, threshold) for rule in RULES},
-        "decided": {rule: _judged(outcomes, rule, threshold, _DECIDED) for rule in RULES},
+        "decided": {rule: _judged(outcomes, rule, threshold, "decided") for rule in RULES},
         "proposal_recall": {"ego": _proposed(outcomes, True), "all": _proposed(outcomes, False)},
     }
 
 
-def clear_candidates(outcomes: Sequence[Outcome], rule: str, word: str = _OWN) -> tuple[NDArray[np.bool_], FloatArray]:
-    """(truth, probability), each (N,), of the candidates that are clearly true or false."""
-    pairs = [_clear(judged, rule, word) for judged in _all(outcomes)]
+def clear_candidates(
+    outcomes: Sequence[FrameOutcome], rule: str, field: ProbabilityField = "probabilities"
+) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Returns (truth, probability), each (N,), of the candidates that are clearly true or false."""
+    pairs = [_clear(judged, rule, field) for judged in _all(outcomes)]
     truth = np.concatenate([t for t, _ in pairs]) if pairs else np.zeros(0, bool)
     return truth, np.concatenate([p for _, p in pairs]) if pairs else np.zeros(0)
 
 
-def _judged(outcomes: Sequence[Outcome], rule: str, threshold: float, word: str = _OWN) -> dict[str, Any]:
-    truth, probability = clear_candidates(outcomes, rule, word)
-    counts = np.array([_confusion(*_clear(judged, rule, word), threshold) for judged in _all(outcomes)]).reshape(-1, 4)
+def _judged(
+    outcomes: Sequence[FrameOutcome], rule: str, threshold: float, field: ProbabilityField = "probabilities"
+) -> dict[str, Any]:
+    truth, probability = clear_candidates(outcomes, rule, field)
+    counts = np.array([_confusion(*_clear(judged, rule, field), threshold) for judged in _all(outcomes)]).reshape(-1, 4)
     frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
     verdicts = np.concatenate([judged.verdicts[rule] for judged in _all(outcomes)] or [np.zeros(0, np.int64)])
     names = {"true": TRUE, "false": FALSE, "unsure": UNSURE, "unknown": UNKNOWN}
@@ -48,7 +52,7 @@ def _judged(outcomes: Sequence[Outcome], rule: str, threshold: float, word: str 
         **{name: int((verdicts == value).sum()) for name, value in names.items()},
         "confusion": dict(zip(("tp", "fp", "fn", "tn"), map(int, counts.sum(axis=0)), strict=True)),
         "base_rate": round(float(truth.mean()), 4) if len(truth) else None,
-        **measured(counts, frames, _rates),
+        **point_estimates(counts, frames, _rates),
         "average_precision": round(float(average_precision_score(truth, probability)), 4) if both else None,
         "calibration": _calibration(truth, probability),
         "intervals": intervals(counts, frames, _rates),
@@ -66,41 +70,44 @@ def _rates(counts: FloatArray) -> dict[str, FloatArray]:
 
 
 def _calibration(truth: NDArray[np.bool_], probability: FloatArray) -> dict[str, Any]:
-    """Ten bins of equal width, and the expected calibration error: their gaps weighed by their counts.
+    """Returns ten bins of equal width, and the expected calibration error: their gaps weighted by their counts.
 
     After C. Guo et al., "On calibration of modern neural networks", 2017, for the probability of being true.
     """
-    place = np.minimum((probability * _BINS).astype(int), _BINS - 1)
+    bin_of = np.minimum((probability * _BINS).astype(int), _BINS - 1)
     bins, error = [], 0.0
     for index in range(_BINS):
-        inside = place == index
-        said, was = (probability[inside], truth[inside]) if inside.any() else (np.full(1, np.nan), np.full(1, np.nan))
-        error += abs(float(was.mean() - said.mean())) * int(inside.sum()) / len(truth) if inside.any() else 0.0
+        inside = bin_of == index
+        count = int(inside.sum())
+        mean_probability = float(probability[inside].mean()) if count else None
+        true_share = float(truth[inside].mean()) if count else None
+        if mean_probability is not None and true_share is not None:
+            error += abs(true_share - mean_probability) * count / len(truth)
         bins.append(
             {
                 "low": index / _BINS,
                 "high": (index + 1) / _BINS,
-                "count": int(inside.sum()),
-                "mean_probability": round(float(said.mean()), 4) if inside.any() else None,
-                "true_share": round(float(was.mean()), 4) if inside.any() else None,
+                "count": count,
+                "mean_probability": None if mean_probability is None else round(mean_probability, 4),
+                "true_share": None if true_share is None else round(true_share, 4),
             }
         )
     return {"expected_error": round(error, 4) if len(truth) else None, "bins": bins}
 
 
-def _proposed(outcomes: Sequence[Outcome], ego: bool) -> dict[str, Any]:
-    """Of the labels, how many have a true candidate among the first 1, 2, ... 32."""
+def _proposed(outcomes: Sequence[FrameOutcome], ego: bool) -> dict[str, Any]:
+    """Returns how many labels have a true candidate among the first 1, 2, ... 32."""
     labels = [[p for p in judged.proposed if p.ego or not ego] for judged in _all(outcomes)]
     frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
-    places = [[p.place for p in frame if p.place is not None] for frame in labels]
-    reached = np.array([np.bincount(p, minlength=MOST_CANDIDATES).cumsum() for p in map(_integers, places)])
+    ranks = [[p.rank for p in frame if p.rank is not None] for frame in labels]
+    reached = np.array([np.bincount(p, minlength=MOST_CANDIDATES).cumsum() for p in map(_integers, ranks)])
     counts = np.column_stack([reached.reshape(-1, MOST_CANDIDATES), [len(frame) for frame in labels]])
     total = counts.sum(axis=0)
     return {
         "labels": int(total[-1]),
         "found": [int(n) for n in total[:-1]],
         "recall": [round(float(n / total[-1]), 4) if total[-1] else None for n in total[:-1]],
-        **measured(counts, frames, _recalls),
+        **point_estimates(counts, frames, _recalls),
         "intervals": intervals(counts, frames, _recalls),
     }
 
@@ -109,24 +116,24 @@ def _recalls(counts: FloatArray) -> dict[str, FloatArray]:
     return {f"recall_{limit}": ratio(counts[:, limit - 1], counts[:, -1]) for limit in (8, 16, 32)}
 
 
-def _all(outcomes: Sequence[Outcome]) -> list[JudgedCandidates]:
+def _all(outcomes: Sequence[FrameOutcome]) -> list[JudgedCandidates]:
     return [outcome.candidates for outcome in outcomes if outcome.candidates is not None]
 
 
-def _clear(judged: JudgedCandidates, rule: str, word: str) -> tuple[NDArray[np.bool_], FloatArray]:
+def _clear(judged: JudgedCandidates, rule: str, field: ProbabilityField) -> tuple[NDArray[np.bool_], FloatArray]:
     verdicts = judged.verdicts[rule]
     clear = (verdicts == TRUE) | (verdicts == FALSE)
-    probabilities: FloatArray = getattr(judged, word)
+    probabilities: FloatArray = getattr(judged, field)
     return verdicts[clear] == TRUE, probabilities[clear]
 
 
 def _confusion(truth: NDArray[np.bool_], probability: FloatArray, threshold: float) -> tuple[int, int, int, int]:
-    said = probability >= threshold
+    accepted = probability >= threshold
     return (
-        int((said & truth).sum()),
-        int((said & ~truth).sum()),
-        int((~said & truth).sum()),
-        int((~said & ~truth).sum()),
+        int((accepted & truth).sum()),
+        int((accepted & ~truth).sum()),
+        int((~accepted & truth).sum()),
+        int((~accepted & ~truth).sum()),
     )
 
 

@@ -1,4 +1,4 @@
-"""Levels B and C: boundaries per frame, and the field's metrics, from the outcomes of frames."""
+"""Figures of levels B and C: boundaries per frame, and the benchmarks' metrics, from the outcomes of frames."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import numpy as np
 
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.evaluation import culane, tusimple
-from lanestream_exporter.evaluation.bootstrap import intervals, measured, ratio
-from lanestream_exporter.evaluation.boundaries import Verdict, errors_along, match, match_ego
-from lanestream_exporter.evaluation.outcomes import Outcome, ego_pair
+from lanestream_exporter.evaluation.benchmarks import culane_frame, tusimple_frame
+from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
+from lanestream_exporter.evaluation.boundaries import FrameMatches, errors_along, match, match_ego
+from lanestream_exporter.evaluation.outcomes import FrameOutcome, ego_pair
 
-_SHARES = 10  # bins of the error against depth
+_DEPTH_BINS = 10  # bins of the error by depth
 
 
-def boundary_figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Level B: the ego pair and all boundaries; see docs/evaluation.md."""
-    ego = [match_ego(outcome.found, outcome.frame) for outcome in outcomes]
+def boundary_figures(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+    """Returns the figures of level B, for the ego pair and all boundaries; see docs/evaluation.md."""
+    ego = [match_ego(outcome.reports, outcome.frame) for outcome in outcomes]
     return {"ego": _matched(outcomes, ego), "all": _matched(outcomes, [match_all(outcome) for outcome in outcomes])}
 
 
-def match_all(outcome: Outcome) -> Verdict:
-    """All reported boundaries of a frame against all its labels."""
-    return match(outcome.found, outcome.frame.lanes, outcome.frame)
+def match_all(outcome: FrameOutcome) -> FrameMatches:
+    """Matches all reported boundaries of a frame to all its labels."""
+    return match(outcome.reports, outcome.frame.lanes, outcome.frame)
 
 
-def field_figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Level C: TuSimple's and CULane's metrics, of all lanes and of the ego pair; see docs/evaluation.md."""
+def field_figures(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+    """Returns the figures of level C, for all lanes and the ego pair; see docs/evaluation.md."""
     pairs = [pair for outcome in outcomes if (pair := ego_pair(outcome)).frame.lanes]
     return {
         "tusimple": _tusimple(outcomes),
@@ -38,20 +38,20 @@ def field_figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def _matched(outcomes: Sequence[Outcome], verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    rows = [(len(v.pairs), v.wrong, v.missed, v.absent, sum(p.error for p in v.pairs), 1) for v in verdicts]
+def _matched(outcomes: Sequence[FrameOutcome], matched: Sequence[FrameMatches]) -> dict[str, Any]:
+    rows = [(len(m.matches), m.wrong, m.missed, m.absent, sum(b.error for b in m.matches), 1) for m in matched]
     counts = np.array(rows, dtype=float).reshape(-1, 6)
     right, wrong, missed, absent = (int(n) for n in counts[:, :4].sum(axis=0))
-    errors = [pair.error for verdict in verdicts for pair in verdict.pairs]
+    errors = [boundary.error for frame_matches in matched for boundary in frame_matches.matches]
     return {
         "frames": len(outcomes),
         "right": right,
         "wrong": wrong,
         "missed": missed,
         "absent": absent,
-        **measured(counts, _frames(outcomes), _boundary_rates),
+        **point_estimates(counts, _frames(outcomes), _boundary_rates),
         "median_error_px_640": round(float(np.median(errors)), 4) if errors else None,
-        "error_by_depth": _by_depth(outcomes, verdicts),
+        "error_by_depth": _by_depth(outcomes, matched),
         "intervals": intervals(counts, _frames(outcomes), _boundary_rates),
     }
 
@@ -69,15 +69,16 @@ def _boundary_rates(counts: FloatArray) -> dict[str, FloatArray]:
     }
 
 
-def _by_depth(outcomes: Sequence[Outcome], verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """Mean error of right boundaries by depth: from the frame's highest labelled row (0) to its lowest row (1)."""
-    total, number = np.zeros(_SHARES), np.zeros(_SHARES)
-    for outcome, verdict in zip(outcomes, verdicts, strict=True):
-        for pair in verdict.pairs:
-            rows, errors = errors_along(outcome.found[pair.found], pair.label, outcome.frame.width)
-            place = np.minimum((_depth(rows, outcome.frame) * _SHARES).astype(int), _SHARES - 1)
-            total += np.bincount(place, errors, _SHARES)
-            number += np.bincount(place, minlength=_SHARES)
+def _by_depth(outcomes: Sequence[FrameOutcome], matched: Sequence[FrameMatches]) -> dict[str, Any]:
+    """Returns the mean error of right boundaries by depth, from the highest labeled row (0) to the bottom row (1)."""
+    total, number = np.zeros(_DEPTH_BINS), np.zeros(_DEPTH_BINS)
+    for outcome, frame_matches in zip(outcomes, matched, strict=True):
+        for boundary in frame_matches.matches:
+            report = outcome.reports[boundary.index]
+            rows, errors = errors_along(report, boundary.label, outcome.frame.width)
+            bins = np.minimum((_depth(rows, outcome.frame) * _DEPTH_BINS).astype(int), _DEPTH_BINS - 1)
+            total += np.bincount(bins, errors, _DEPTH_BINS)
+            number += np.bincount(bins, minlength=_DEPTH_BINS)
     means = [round(float(t / n), 4) if n else None for t, n in zip(total, number, strict=True)]
     return {"samples": [int(n) for n in number], "mean_px_640": means}
 
@@ -87,13 +88,13 @@ def _depth(rows: FloatArray, frame: LabelledFrame) -> FloatArray:
     return np.clip((rows - top) / max(frame.height - 1.0 - top, 1.0), 0.0, 1.0)
 
 
-def _tusimple(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    scores = [tusimple.score_frame(outcome.found, outcome.frame) for outcome in outcomes]
+def _tusimple(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+    scores = [tusimple_frame(outcome.reports, outcome.frame) for outcome in outcomes]
     counts = np.array([(s.accuracy, s.fp, s.fn, 1.0) for s in scores]).reshape(-1, 4)
     return {
         "frames": len(outcomes),
         "labels": sum(len(outcome.frame.lanes) for outcome in outcomes),
-        **measured(counts, _frames(outcomes), _tusimple_means),
+        **point_estimates(counts, _frames(outcomes), _tusimple_means),
         "intervals": intervals(counts, _frames(outcomes), _tusimple_means),
     }
 
@@ -108,8 +109,8 @@ def _harmonic(precision: FloatArray, recall: FloatArray) -> FloatArray:
     return ratio(2.0 * precision * recall, precision + recall)
 
 
-def _culane(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    counted = [culane.count_frame(outcome.found, outcome.frame) for outcome in outcomes]
+def _culane(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+    counted = [culane_frame(outcome.reports, outcome.frame) for outcome in outcomes]
     counts = np.array([(c.tp, c.fp, c.fn) for c in counted], dtype=float).reshape(-1, 3)
     tp, fp, fn = (int(n) for n in counts.sum(axis=0))
     return {
@@ -117,7 +118,7 @@ def _culane(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "tp": tp,
         "fp": fp,
         "fn": fn,
-        **measured(counts, _frames(outcomes), _culane_rates),
+        **point_estimates(counts, _frames(outcomes), _culane_rates),
         "intervals": intervals(counts, _frames(outcomes), _culane_rates),
     }
 
@@ -127,5 +128,5 @@ def _culane_rates(counts: FloatArray) -> dict[str, FloatArray]:
     return {"precision": ratio(tp, tp + fp), "recall": ratio(tp, tp + fn), "f1": ratio(2.0 * tp, 2.0 * tp + fp + fn)}
 
 
-def _frames(outcomes: Sequence[Outcome]) -> list[LabelledFrame]:
+def _frames(outcomes: Sequence[FrameOutcome]) -> list[LabelledFrame]:
     return [outcome.frame for outcome in outcomes]

@@ -15,15 +15,15 @@ from lanestream.road.view import Image
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.datasets.splits import LabelledClip, Split, labelled_clips, real_frames
-from lanestream_exporter.evaluation.boundaries import Found
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
 from lanestream_exporter.evaluation.lateral import lateral_figures
 from lanestream_exporter.evaluation.methods import Method
-from lanestream_exporter.evaluation.outcomes import Outcome
+from lanestream_exporter.evaluation.outcomes import FrameOutcome
 from lanestream_exporter.evaluation.steadiness import steadiness
 
-SCHEMA = 1
+SCHEMA = 2
 OVERALL = "overall"
 
 Frames = Callable[[], Iterable[tuple[LabelledFrame, Image]]]
@@ -47,9 +47,9 @@ class Material:
 class ClipRun:
     """A clip as one method saw it: every frame of it in order, and its labelled frames with the memory and without."""
 
-    reported: list[tuple[Found, ...]] = field(default_factory=list)
-    tracked: list[Outcome] = field(default_factory=list)
-    alone: list[Outcome] = field(default_factory=list)
+    reported: list[tuple[ReportedBoundary, ...]] = field(default_factory=list)
+    tracked: list[FrameOutcome] = field(default_factory=list)
+    alone: list[FrameOutcome] = field(default_factory=list)
     size: tuple[int, int] = (1, 1)
 
     def figures(self) -> dict[str, Any]:
@@ -67,7 +67,7 @@ class Evaluation:
 
     material: Material
     methods: tuple[Method, ...]
-    images: dict[str, list[Outcome]]
+    images: dict[str, list[FrameOutcome]]
     clips: dict[str, dict[str, ClipRun]]
 
     def figures(self) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class Evaluation:
         return {
             "schema": SCHEMA,
             "material": self.material.name,
-            "methods": {m.name: {"kind": m.kind, "guided_by": m.guided_by} for m in self.methods},
+            "methods": {m.name: {"kind": m.kind, "regressor": m.regressor} for m in self.methods},
             "images": {method.name: self._of_images(method) for method in self.methods},
             "clips": {method.name: self._of_clips(method) for method in self.methods},
         }
@@ -94,7 +94,7 @@ class Evaluation:
         return {**figures, OVERALL: {"tracked": boundary_figures(tracked), "alone": boundary_figures(alone)}}
 
 
-def image_figures(method: Method, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def image_figures(method: Method, outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
     """All figure groups of a method on single images. A further group is one more entry here."""
     figures: dict[str, Any] = {
         "boundaries": boundary_figures(outcomes),
@@ -106,9 +106,9 @@ def image_figures(method: Method, outcomes: Sequence[Outcome]) -> dict[str, Any]
     return figures
 
 
-def by_drive(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
+def by_drive(outcomes: Sequence[FrameOutcome]) -> dict[str, list[FrameOutcome]]:
     """The outcomes of each drive, and all of them together under `overall`."""
-    drives: dict[str, list[Outcome]] = {}
+    drives: dict[str, list[FrameOutcome]] = {}
     for outcome in outcomes:
         drives.setdefault(outcome.frame.group, []).append(outcome)
     return {**drives, OVERALL: list(outcomes)}
@@ -119,11 +119,11 @@ def evaluate(methods: Sequence[Method], material: Material, tell: Callable[[str]
 
     Raises LabelError and SourceError for material that can't be read, or of which nothing is labelled.
     """
-    images: dict[str, list[Outcome]] = {method.name: [] for method in methods}
+    images: dict[str, list[FrameOutcome]] = {method.name: [] for method in methods}
     tell("single images")
     for frame, image in material.images():
         for method in methods:
-            images[method.name].append(method.look(image, frame))
+            images[method.name].append(method.detect(image, frame))
     clips: dict[str, dict[str, ClipRun]] = {method.name: {} for method in methods}
     for clip in material.clips:
         tell(clip.name)
@@ -137,7 +137,7 @@ def evaluate(methods: Sequence[Method], material: Material, tell: Callable[[str]
 def _follow(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]:
     wanted = read_clip_labels(clip.labels, clip.coverage)
     runs = {method.name: ClipRun() for method in methods}
-    followers = {method.name: method.follow() for method in methods}
+    followers = {method.name: method.start_clip() for method in methods}
     for index, image, timestamp in _decoded(clip.video, clip.frames):
         for method in methods:
             run = runs[method.name]
@@ -145,8 +145,8 @@ def _follow(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]
             run.reported.append(found)
             run.size = (image.shape[1], image.shape[0])
             if index in wanted:
-                run.tracked.append(Outcome(wanted[index], found))
-                run.alone.append(method.look(image, wanted[index]))
+                run.tracked.append(FrameOutcome(wanted[index], found))
+                run.alone.append(method.detect(image, wanted[index]))
     return runs
 
 

@@ -1,4 +1,4 @@
-"""What is measured: models with the service's own engine, and the peers."""
+"""The methods that are evaluated: models in the service's own engine, and the baselines."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from lanestream.engine import Engine
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.evaluation.boundaries import Found
-from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, Outcome, judge
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary
+from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, FrameOutcome, judge
 
-# Takes the frames of a clip in order, each with its time in seconds, and says what is there.
-Follower = Callable[[Image, float], tuple[Found, ...]]
+# Takes the frames of a clip in order, each with its time in seconds, and returns the boundaries of each.
+ClipTracker = Callable[[Image, float], tuple[ReportedBoundary, ...]]
 
 
 class Method(Protocol):
-    """Something that finds boundaries: `kind` is classifier, regressor or peer."""
+    """A method that finds boundaries."""
 
     @property
     def name(self) -> str:
-        """The method's name in reports, unique among those of one evaluation."""
+        """Returns the name in reports, unique in an evaluation."""
         ...
 
     @property
     def kind(self) -> str:
-        """What it is."""
+        """Returns `classifier`, `regressor` or `baseline`."""
         ...
 
     @property
     def threshold(self) -> float | None:
-        """The probability from which on a candidate is accepted; None for what has no candidates."""
+        """Returns the probability from which a candidate is accepted; None for methods without candidates."""
         ...
 
     @property
-    def guided_by(self) -> str | None:
-        """The regressor that shows a classifier where to look; None without one."""
+    def regressor(self) -> str | None:
+        """Returns the name of the regressor that gives a classifier its ego-lane prior; None without one."""
         ...
 
-    def look(self, image: Image, frame: LabelledFrame) -> Outcome:
-        """A BGR image (H, W, 3) by itself."""
+    def detect(self, image: Image, frame: LabelledFrame) -> FrameOutcome:
+        """Evaluates a single BGR image (H, W, 3)."""
         ...
 
-    def follow(self) -> Follower:
-        """A fresh memory for the frames of one clip."""
+    def start_clip(self) -> ClipTracker:
+        """Returns a tracker with empty state for the frames of one clip."""
         ...
 
 
-class Model:
+class ServedModel:
     """A model file in the service's engine, with the tracker of its sessions."""
 
     def __init__(self, engine: Engine) -> None:
@@ -61,62 +61,62 @@ class Model:
         detector = engine.detector
         self._wide: CandidateDetector | None = None
         self.threshold: float | None = None
-        self.guided_by: str | None = None
+        self.regressor: str | None = None
         if isinstance(detector, CandidateDetector):
             self._wide = replace(detector, search=replace(detector.search, limit=MOST_CANDIDATES))
             self.threshold = detector.threshold
-            glance = engine.pipeline().glance
-            self.guided_by = None if glance is None else glance.network.name
+            prior_estimator = engine.pipeline().glance
+            self.regressor = None if prior_estimator is None else prior_estimator.network.name
 
-    def look(self, image: Image, frame: LabelledFrame) -> Outcome:
-        """A single image: the first frame of a new session."""
+    def detect(self, image: Image, frame: LabelledFrame) -> FrameOutcome:
+        """Evaluates a single image as the first frame of a new session."""
         session = self._engine.open_session()
         prepared = answered(session.prepare(image))
         outputs = self._engine.network.run(prepared.inputs)
-        found = _found(session.conclude(prepared, outputs, 0.0))
+        reports = _reports(session.conclude(prepared, outputs, 0.0))
         if self._wide is None:
-            return Outcome(frame, found)
+            return FrameOutcome(frame, reports)
         wide = answered(replace(self._engine.pipeline(), detector=self._wide).prepare(image))
-        return Outcome(frame, found, judge(prepared, outputs, wide, frame))
+        return FrameOutcome(frame, reports, judge(prepared, outputs, wide, frame))
 
-    def follow(self) -> Follower:
-        """A session with its tracker."""
+    def start_clip(self) -> ClipTracker:
+        """Returns the tracker of a new session."""
         session = self._engine.open_session()
-        return lambda image, timestamp: _found(self._engine.process(session, image, timestamp))
+        return lambda image, timestamp: _reports(self._engine.process(session, image, timestamp))
 
 
-class FinderOfBoundaries(Protocol):
-    """A peer's whole interface."""
+class BaselineDetector(Protocol):
+    """The interface of a baseline's algorithm."""
 
     @property
     def name(self) -> str:
-        """The peer's name in reports."""
+        """Returns the name in reports."""
         ...
 
-    def find(self, image: Image) -> tuple[Found, ...]:
-        """The ego boundaries of a BGR image (H, W, 3)."""
+    def detect(self, image: Image) -> tuple[ReportedBoundary, ...]:
+        """Returns the ego boundaries of a BGR image (H, W, 3)."""
         ...
 
 
-class Peer:
-    """A peer as a method. It has no memory: of a clip it says what it says of its single frames."""
+class Baseline:
+    """A baseline as a method. It has no memory, so its results on clips are those of the single frames."""
 
-    kind = "peer"
+    kind = "baseline"
     threshold = None
-    guided_by = None
+    regressor = None
 
-    def __init__(self, finder: FinderOfBoundaries) -> None:
-        self._finder = finder
-        self.name = finder.name
+    def __init__(self, detector: BaselineDetector) -> None:
+        self._detector = detector
+        self.name = detector.name
 
-    def look(self, image: Image, frame: LabelledFrame) -> Outcome:
-        """A single image."""
-        return Outcome(frame, self._finder.find(image))
+    def detect(self, image: Image, frame: LabelledFrame) -> FrameOutcome:
+        """Evaluates a single image."""
+        return FrameOutcome(frame, self._detector.detect(image))
 
-    def follow(self) -> Follower:
-        """The same, frame by frame."""
-        return lambda image, _: self._finder.find(image)
+    def start_clip(self) -> ClipTracker:
+        """Returns the detector itself, without state."""
+        return lambda image, _: self._detector.detect(image)
 
 
-def _found(result: FrameResult) -> tuple[Found, ...]:
-    return tuple(Found.of(lane) for lane in result.lanes)
+def _reports(result: FrameResult) -> tuple[ReportedBoundary, ...]:
+    return tuple(ReportedBoundary.from_lane(lane) for lane in result.lanes)

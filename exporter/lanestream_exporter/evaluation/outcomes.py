@@ -1,4 +1,4 @@
-"""What is kept of a frame that a method has looked at: enough for every figure, without the image."""
+"""The outcome of a method on one frame: everything that the figures need, without the image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lanestream.detection import Prepared
 from lanestream.detection.candidate_detector import TRUE_LANE, CandidateDetector
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.evaluation.boundaries import Found, ego_sides
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_sides
 from lanestream_exporter.samples.patches import TruthRule, distance_along
 
 MOST_CANDIDATES = 32
@@ -19,51 +19,51 @@ RULES = {"far_40": TruthRule(far=40.0), "far_30": TruthRule(far=30.0)}
 
 
 @dataclass(frozen=True)
-class Proposed:
-    """A label and the place (from 0) of the first candidate that is true to it; None where none of the 32 is."""
+class LabelProposal:
+    """A label and the rank (from 0) of the first candidate that is true to it; None if none of the 32 is."""
 
     ego: bool
-    place: int | None
+    rank: int | None
 
 
 @dataclass(frozen=True)
 class JudgedCandidates:
-    """Level A of one frame: probabilities (N,), verdicts (N,) under each of `RULES`, and what was proposed at all.
+    """Level A for one frame: probabilities (N,), verdicts (N,) under each of `RULES`, and the proposals of all labels.
 
-    `probabilities` are the classifier's own, `decided` (N,) those by which the detector accepts.
+    `probabilities` are the classifier's own; `decided` (N,) are those that the detector's decision is based on.
     """
 
     probabilities: NDArray[np.float64]
     decided: NDArray[np.float64]
     verdicts: dict[str, NDArray[np.int64]]
-    proposed: tuple[Proposed, ...]
+    proposed: tuple[LabelProposal, ...]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """A labelled frame, what a method reported for it and, for a classifier, its candidates."""
+class FrameOutcome:
+    """A labeled frame, the boundaries that a method reported for it and, for a classifier, its candidates."""
 
     frame: LabelledFrame
-    found: tuple[Found, ...]
+    reports: tuple[ReportedBoundary, ...]
     candidates: JudgedCandidates | None = None
 
 
-def ego_pair(outcome: Outcome) -> Outcome:
-    """The same frame without all that is neither labelled nor reported as a boundary of the ego lane."""
+def ego_pair(outcome: FrameOutcome) -> FrameOutcome:
+    """Returns the same frame with only the labels and reports of the ego lane's boundaries."""
     lanes = tuple(lane for lane in ego_sides(outcome.frame) if lane is not None)
-    found = tuple(boundary for boundary in outcome.found if abs(boundary.position) == 1)
-    return Outcome(replace(outcome.frame, lanes=lanes), found)
+    reports = tuple(report for report in outcome.reports if abs(report.position) == 1)
+    return FrameOutcome(replace(outcome.frame, lanes=lanes), reports)
 
 
 def judge(prepared: Prepared, outputs: NDArray[np.float32], wide: Prepared, frame: LabelledFrame) -> JudgedCandidates:
-    """The candidates that the classifier saw against the labels, and those up to 32 that `wide` has instead."""
+    """Judges the candidates that the classifier saw, and up to 32 candidates of `wide`, against the labels."""
     verdicts = {name: rule.judge(prepared.candidates, frame, prepared.view) for name, rule in RULES.items()}
-    ego, near = ego_sides(frame), RULES["far_40"]
+    ego, rule = ego_sides(frame), RULES["far_40"]
     proposed = []
     for lane in frame.lanes:
         measured = [distance_along(c, lane, wide.view) for c in wide.candidates[:MOST_CANDIDATES]]
-        true = [d * 1280.0 / frame.width <= near.near and overlap >= near.overlap for d, overlap in measured]
-        place = true.index(True) if any(true) else None
-        proposed.append(Proposed(any(lane is mine for mine in ego), place))
+        true = [d * 1280.0 / frame.width <= rule.near and overlap >= rule.overlap for d, overlap in measured]
+        rank = true.index(True) if any(true) else None
+        proposed.append(LabelProposal(any(lane is side for side in ego), rank))
     own, decided = outputs[:, TRUE_LANE].astype(np.float64), CandidateDetector.judged(prepared, outputs)
     return JudgedCandidates(own, decided, verdicts, tuple(proposed))

@@ -1,22 +1,40 @@
-"""The report: one HTML file with tables, charts and the worst frames, that needs nothing beside it."""
+"""The HTML report: one self-contained file with tables, charts and the worst frames."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import base64
+import io
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
+import matplotlib as mpl
+import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from sklearn.metrics import ConfusionMatrixDisplay, PrecisionRecallDisplay
 
+from lanestream.road.curve import FloatArray
+from lanestream.road.view import Image
 from lanestream_exporter.evaluation.bootstrap import SPAN, STILLS
-from lanestream_exporter.evaluation.charts import RULE, charts
-from lanestream_exporter.evaluation.gallery import gallery
-from lanestream_exporter.evaluation.measuring import Evaluation
-from lanestream_exporter.evaluation.outcomes import RULES
+from lanestream_exporter.evaluation.boundaries import match_ego
+from lanestream_exporter.evaluation.candidates import clear_candidates
+from lanestream_exporter.evaluation.figures import match_all
+from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, Material, by_drive
+from lanestream_exporter.evaluation.outcomes import RULES, FrameOutcome
+
+CHART_RULE = "far_40"
+GALLERY_FRAMES = 24
+_GALLERY_WIDTH = 480
+_LABEL_COLOR, _EGO_COLOR, _OTHER_COLOR = (80, 220, 80), (60, 60, 255), (255, 160, 40)  # blue, green, red
 
 
 def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any]) -> Path:
-    """Writes `report.html` into `folder`, which is made where it is missing; the path of the file."""
+    """Writes `report.html` to `folder`, creating the folder if missing, and returns the path of the file."""
     environment = Environment(
         loader=PackageLoader("lanestream_exporter.evaluation", ""),
         autoescape=select_autoescape(["html", "jinja"]),
@@ -28,11 +46,10 @@ def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any
     first = evaluation.methods[0]
     page = environment.get_template("report.html.jinja").render(
         figures=figures,
-        rule=RULE,
         rules=list(RULES),
         block={"stills": STILLS, "span": SPAN},
         charts=charts(evaluation, figures),
-        shown=first.name,
+        gallery_method=first.name,
         gallery=gallery(evaluation.material, evaluation.images[first.name]),
     )
     folder.mkdir(parents=True, exist_ok=True)
@@ -47,3 +64,146 @@ def _share(value: float | None) -> str:
 
 def _interval(value: list[float] | None) -> str:
     return "" if value is None else f"[{value[0]:.3f}, {value[1]:.3f}]"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart as SVG with its caption."""
+
+    caption: str
+    svg: str = field(repr=False)
+
+
+def charts(evaluation: Evaluation, figures: Mapping[str, Any]) -> list[Chart]:
+    """Draws all charts: those of level A for every classifier, then the error by depth of all methods."""
+    images = figures["images"]
+    result: list[Chart] = []
+    for method in evaluation.methods:
+        if method.threshold is not None:
+            result += _candidate_charts(method.name, evaluation.images[method.name], images[method.name])
+    caption = "Error of the right ego boundaries by depth, single images, all drives"
+    return [*result, _chart(caption, lambda axes: _draw_depth(axes, images))]
+
+
+def _candidate_charts(name: str, outcomes: Sequence[FrameOutcome], drives: Mapping[str, Any]) -> Iterator[Chart]:
+    judged = drives[OVERALL]["candidates"][CHART_RULE]
+    yield _chart(f"{name}: precision and recall of candidates, by drive", lambda axes: _draw_curves(axes, outcomes))
+    yield _chart(
+        f"{name}: candidates, all drives, at the model's threshold",
+        lambda axes: _draw_confusion(axes, judged["confusion"]),
+    )
+    yield _chart(
+        f"{name}: reliability, all drives, with the count of each bin",
+        lambda axes: _draw_reliability(axes, judged["calibration"]["bins"]),
+    )
+    yield _chart(f"{name}: proposal recall by number of candidates", lambda axes: _draw_proposals(axes, drives))
+
+
+def _draw_curves(axes: Axes, outcomes: Sequence[FrameOutcome]) -> None:
+    for drive, part in by_drive(outcomes).items():
+        truth, probability = clear_candidates(part, CHART_RULE)
+        if truth.any():
+            PrecisionRecallDisplay.from_predictions(truth, probability, ax=axes, name=drive)
+    axes.set(xlabel="recall", ylabel="precision", xlim=(0.0, 1.02), ylim=(0.0, 1.02))
+
+
+def _draw_confusion(axes: Axes, counts: Mapping[str, int]) -> None:
+    matrix = np.array([[counts["tn"], counts["fp"]], [counts["fn"], counts["tp"]]])
+    display = ConfusionMatrixDisplay(matrix, display_labels=["no boundary", "boundary"])
+    display.plot(ax=axes, colorbar=False, cmap="Blues", values_format="d")
+    axes.set(xlabel="classifier", ylabel="label")
+
+
+def _draw_reliability(axes: Axes, bins: Sequence[Mapping[str, Any]]) -> None:
+    axes.plot([0.0, 1.0], [0.0, 1.0], color="0.7", linewidth=1.0)
+    points = [(b["mean_probability"], b["true_share"], b["count"]) for b in bins if b["count"]]
+    axes.plot([predicted for predicted, _, _ in points], [true for _, true, _ in points], marker="o")
+    for predicted, true, count in points:
+        axes.annotate(str(count), (predicted, true), (4, -10), textcoords="offset points")
+    axes.set(xlabel="mean probability", ylabel="share of true candidates", xlim=(0.0, 1.05), ylim=(0.0, 1.05))
+
+
+def _draw_proposals(axes: Axes, drives: Mapping[str, Any]) -> None:
+    for index, (drive, part) in enumerate(drives.items()):
+        for which, style in (("ego", "-"), ("all", "--")):
+            recall = part["candidates"]["proposal_recall"][which]["recall"]
+            if recall[0] is not None:
+                axes.plot(range(1, len(recall) + 1), recall, style, color=f"C{index}", label=f"{drive}: {which}")
+    axes.set(xlabel="candidates per frame", ylabel="share of labels with a true candidate", ylim=(0.0, 1.02))
+    axes.legend(fontsize=7)
+
+
+def _draw_depth(axes: Axes, images: Mapping[str, Any]) -> None:
+    for name, drives in images.items():
+        means = drives[OVERALL]["boundaries"]["ego"]["error_by_depth"]["mean_px_640"]
+        shares = (np.arange(len(means)) + 0.5) / len(means)
+        axes.plot(shares, [np.nan if mean is None else mean for mean in means], marker=".", label=name)
+    axes.set(xlabel="depth: 0 highest labeled row, 1 bottom row", ylabel="mean error, px at 640 wide")
+    axes.set_ylim(bottom=0.0)
+    axes.legend(fontsize=7)
+
+
+def _chart(caption: str, draw: Callable[[Axes], None]) -> Chart:
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": caption, "font.size": 9}):
+        figure = Figure(figsize=(5.2, 3.9), layout="constrained")
+        axes = figure.subplots()
+        draw(axes)
+        if not axes.images:
+            axes.grid(alpha=0.25)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    # The charts share a page, so their ids must not collide.
+    prefix = re.sub(r"\W+", "-", caption) + "-"
+    svg = re.sub(r'(id="|href="#|url\(#)', lambda found: found.group(1) + prefix, buffer.getvalue())
+    return Chart(caption, svg[svg.index("<svg") :])
+
+
+@dataclass(frozen=True)
+class GalleryImage:
+    """One frame of the gallery: a JPEG as a data URL, and a caption with its mistakes."""
+
+    caption: str
+    url: str = field(repr=False)
+
+
+def gallery(dataset: Material, outcomes: Sequence[FrameOutcome]) -> list[GalleryImage]:
+    """Draws the worst frames, worst first. Reads the images again, so that the evaluation need not keep them."""
+    worst = sorted(range(len(outcomes)), key=lambda i: _badness(outcomes[i]), reverse=True)[:GALLERY_FRAMES]
+    rank_of = {index: rank for rank, index in enumerate(worst)}
+    images: dict[int, GalleryImage] = {}
+    for index, (_, image) in enumerate(dataset.images()):
+        if index in rank_of:
+            images[rank_of[index]] = _gallery_image(image, outcomes[index])
+    return [images[rank] for rank in sorted(images)]
+
+
+def _badness(outcome: FrameOutcome) -> tuple[int, int, float]:
+    """Returns a sort key: mistakes of the ego pair, then of all boundaries, then the mean error."""
+    ego, every = match_ego(outcome.reports, outcome.frame), match_all(outcome)
+    error = float(np.mean([match.error for match in every.matches])) if every.matches else 0.0
+    return ego.missed + ego.wrong, every.missed + every.wrong, error
+
+
+def _gallery_image(image: Image, outcome: FrameOutcome) -> GalleryImage:
+    frame = outcome.frame
+    scale = _GALLERY_WIDTH / frame.width
+    size = _GALLERY_WIDTH, round(frame.height * scale)
+    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    for lane in frame.lanes:
+        _draw_line(small, lane.points * scale, _LABEL_COLOR, 2)
+    for report in outcome.reports:
+        rows = np.linspace(report.top, report.bottom, 32)
+        points = np.stack([report.curve.x(rows), rows], axis=1) * scale
+        _draw_line(small, points, _EGO_COLOR if report.position in (-1, 1) else _OTHER_COLOR, 1)
+    ego, every = match_ego(outcome.reports, frame), match_all(outcome)
+    caption = (
+        f"{frame.group}, {frame.source}: ego {len(ego.matches)} right, {ego.wrong} wrong, {ego.missed} missed; "
+        f"all {len(every.matches)} right, {every.wrong} wrong, {every.missed} missed"
+    )
+    encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+    return GalleryImage(caption, "data:image/jpeg;base64," + base64.b64encode(encoded).decode())
+
+
+def _draw_line(image: Image, points: FloatArray, color: tuple[int, int, int], thickness: int) -> None:
+    path = np.round(np.clip(points, -1e4, 1e4)).astype(np.int32)
+    cv2.polylines(image, [path], isClosed=False, color=color, thickness=thickness, lineType=cv2.LINE_AA)

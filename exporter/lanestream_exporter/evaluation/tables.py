@@ -1,4 +1,4 @@
-"""The figures that matter most, for the terminal."""
+"""Tables of the main figures, for the terminal."""
 
 from __future__ import annotations
 
@@ -9,30 +9,32 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-# The cells of a row, from a method's figure groups of a drive; none where it has no such figures.
-Values = Callable[[Mapping[str, Any]], list[float | None]]
+# Returns the cells of a row from a method's figure groups for a drive; an empty list if it has no such figures.
+RowCells = Callable[[Mapping[str, Any]], list[float | None]]
 
-_LATERAL = ("10 m", "ratio", "30 m", "ratio", "straight on")
-_FIELD = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
-_JUDGED = ("base rate", "P", "R", "Acc", "AP")
-_DECIDED = (*_JUDGED, "ego prop.", "all prop.")
+_LATERAL = ("10 m", "ratio", "30 m", "ratio", "straight ratio")
+_BENCHMARKS = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
+_CANDIDATES = ("base rate", "P", "R", "Acc", "AP")
+_DECISIONS = (*_CANDIDATES, "ego prop.", "all prop.")
 _BOUNDARIES = ("ego P", "ego R", "ego F1", "px", "all P", "all R", "all F1")
 
 
 def tables(figures: Mapping[str, Any]) -> Iterator[Table]:
-    """A table for each level: a part for each drive, a row for each method."""
+    """Yields the tables of each level, with a section per drive and a row per method."""
     images, clips = figures["images"], figures["clips"]
-    yield _table("A. Candidates by the classifier: false beyond 40 px", _JUDGED, images, _candidates)
-    yield _table("A. Candidates by the detector, and proposed among the first 16", _DECIDED, images, _decided)
+    yield _table("A. Candidates, by the classifier's probability: false beyond 40 px", _CANDIDATES, images, _candidates)
+    yield _table("A. Candidates, by the detector's decision, and proposal recall with 16", _DECISIONS, images, _decided)
     yield _table("B. Single images: boundaries, error in px at 640 wide", _BOUNDARIES, images, _on_images)
     if any(clips.values()):
         yield _table("B. Clips with the tracker", _BOUNDARIES, clips, lambda groups: _boundaries(groups["tracked"]))
         yield _table("B. Clips frame by frame", _BOUNDARIES, clips, lambda groups: _boundaries(groups["alone"]))
     yield _table(
-        "Lateral error of the ego pair, px at 640 wide, and over a constant answer's", _LATERAL, images, _lateral
+        "Lateral error of the ego pair, px at 640 wide, and ratio to a constant prediction", _LATERAL, images, _lateral
     )
-    yield _table("C. The field's metrics", _FIELD, images, lambda groups: _field(groups["field"]))
-    yield _table("C. The same of the ego pair alone", _FIELD, images, lambda groups: _field(groups["field"]["ego"]))
+    yield _table("C. Benchmark metrics", _BENCHMARKS, images, lambda groups: _field(groups["field"]))
+    yield _table(
+        "C. Benchmark metrics of the ego pair only", _BENCHMARKS, images, lambda groups: _field(groups["field"]["ego"])
+    )
 
 
 def _candidates(groups: Mapping[str, Any]) -> list[float | None]:
@@ -71,13 +73,13 @@ def _field(part: Mapping[str, Any]) -> list[float | None]:
     return [tusimple["accuracy"], tusimple["fp"], tusimple["fn"], culane["f1"]]
 
 
-def _table(title: str, columns: Sequence[str], methods: Mapping[str, Any], values: Values) -> Table:
+def _table(title: str, columns: Sequence[str], methods: Mapping[str, Any], cells: RowCells) -> Table:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("")
     for column in columns:
         table.add_column(column, justify="right")
     for drive in next(iter(methods.values())):
-        rows = [(method, values(drives[drive])) for method, drives in methods.items()]
+        rows = [(method, cells(drives[drive])) for method, drives in methods.items()]
         if any(row for _, row in rows):
             table.add_row(Text(drive, style="bold"))
         for method, row in rows:

@@ -1,4 +1,4 @@
-"""From a checkpoint to a model file that describes itself and has proved itself."""
+"""Exports a checkpoint to an ONNX file that describes itself and is verified against PyTorch."""
 
 import os
 

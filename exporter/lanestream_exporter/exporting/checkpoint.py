@@ -1,4 +1,4 @@
-"""Which network a checkpoint holds, this project's own or a torchvision AlexNet from elsewhere."""
+"""Reading a checkpoint for export: one of this project's networks, or a torchvision AlexNet from elsewhere."""
 
 from __future__ import annotations
 
@@ -14,125 +14,127 @@ from torch import Tensor, nn
 from lanestream.detection.patches import PatchGeometry
 from lanestream.errors import CheckpointError
 from lanestream_exporter.alexnet import FULL, AlexNet, Shape, load_state
-from lanestream_exporter.exporting.classifier import ClassifierSubject
-from lanestream_exporter.exporting.regressor import RegressorSubject
-from lanestream_exporter.exporting.subject import Subject
+from lanestream_exporter.exporting.classifier import ExportableClassifier
+from lanestream_exporter.exporting.exportable import ExportableNetwork
+from lanestream_exporter.exporting.regressor import ExportableRegressor
 from lanestream_exporter.regressor import LaneRegressor
 from lanestream_exporter.training.config import NetworkSize
 
 _LANE: Final = "lane"
-_LAST: Final = "classifier.6.weight"
+_LAST_LAYER: Final = "classifier.6.weight"
 
-# Under one of these other trainers keep the weights.
-_WRAPPED: Final = ("model", "state_dict", "model_state_dict")
+# Keys under which other trainers store the weights.
+_WRAPPER_KEYS: Final = ("model", "state_dict", "model_state_dict")
 
 
 @dataclass(frozen=True)
-class Foreign:
-    """What a checkpoint from elsewhere doesn't say: its `classes` in order, its strips, its pixels' normalisation."""
+class ForeignNetwork:
+    """What a checkpoint from elsewhere does not record: its `classes` in order, its patches and pixel normalization."""
 
     classes: tuple[str, ...]
-    strip: PatchGeometry
-    normalisation: str = "imagenet"
+    patch_geometry: PatchGeometry
+    normalization: str = "imagenet"
 
 
-def read_subject(path: Path, foreign: Foreign | None = None) -> tuple[Subject, dict[str, Any]]:
-    """The network in the checkpoint at `path`, ready to be exported, and what is known of its training.
+def read_network(path: Path, foreign: ForeignNetwork | None = None) -> tuple[ExportableNetwork, dict[str, Any]]:
+    """Reads the network in the checkpoint at `path` and the record of its training, without executing code from it.
 
-    No code of the file is run. `foreign` is for a plain AlexNet of torchvision's key names; a checkpoint of this
-    project's trainer tells everything itself. Raises CheckpointError where the file holds neither.
+    Give `foreign` for a plain AlexNet with torchvision's key names; a checkpoint of this project's trainer records
+    everything itself. Raises CheckpointError if the file holds neither.
     """
     state = load_state(path)
     if "network" in state:
         if foreign is not None:
-            raise CheckpointError(f"{path} is a checkpoint of this trainer", "leave --classes and --strip off")
-        return _own(path, state), _training(state)
-    weights = _unwrapped(path, state)
+            raise CheckpointError(f"{path} is a checkpoint of this trainer", "remove --classes and --patch")
+        return _read_own(path, state), _training_record(state)
+    weights = _unwrap(path, state)
     if foreign is None:
         raise CheckpointError(
-            f"{path} is no checkpoint of this trainer",
-            "give the best.pt of a run, or, for a torchvision AlexNet, --classes and --strip",
+            f"{path} is not a checkpoint of this trainer",
+            "give the best.pt of a run; for a torchvision AlexNet, also give --classes and --patch",
         )
-    return _foreign(path, weights, foreign), {"data": "not recorded", "source": "a torchvision AlexNet from elsewhere"}
+    record = {"data": "not recorded", "source": "a torchvision AlexNet from elsewhere"}
+    return _read_foreign(path, weights, foreign), record
 
 
-def _own(path: Path, state: Mapping[str, Any]) -> Subject:
+def _read_own(path: Path, state: Mapping[str, Any]) -> ExportableNetwork:
     weights = state["network"]
     shape = _recorded_shape(path, state)
     if "shape.0.weight" in weights:
         regressor = LaneRegressor(shape, normalised=_has_norms(weights))
-        _load(path, regressor, weights)
-        return RegressorSubject(regressor.eval().folded())
-    return ClassifierSubject(_alexnet(path, weights, shape), strip=PatchGeometry(shape.size))
+        _load_weights(path, regressor, weights)
+        return ExportableRegressor(regressor.eval().folded())
+    return ExportableClassifier(_load_alexnet(path, weights, shape), patch_geometry=PatchGeometry(shape.size))
 
 
 def _recorded_shape(path: Path, state: Mapping[str, Any]) -> Shape:
-    """How large the run made its network; runs that did not record it made the whole AlexNet."""
+    """Returns the network size that the run recorded; older runs recorded none and used the full AlexNet."""
     config = (state.get("record") or {}).get("config") or {}
     if "network" not in config:
         return FULL
     try:
         return NetworkSize.model_validate(config["network"]).shape
     except ValidationError:
-        hint = "give a best.pt as the trainer wrote it"
-        raise CheckpointError(f"{path} does not say how large its network is", hint) from None
+        hint = "give an unmodified best.pt of the trainer"
+        raise CheckpointError(f"{path} does not record a valid network size", hint) from None
 
 
-def _foreign(path: Path, weights: Mapping[str, Tensor], foreign: Foreign) -> ClassifierSubject:
-    classes = foreign.classes
+def _read_foreign(path: Path, weights: Mapping[str, Tensor], foreign: ForeignNetwork) -> ExportableClassifier:
+    classes, geometry = foreign.classes, foreign.patch_geometry
     if len(classes) != 2 or _LANE not in classes:
         raise CheckpointError(
-            f"the classes {', '.join(classes)} can't be served", f"two are, one of them {_LANE}, in the network's order"
+            f"the classes {', '.join(classes)} can't be served",
+            f"give two classes in the network's order, one of them {_LANE}",
         )
-    if foreign.strip.size != FULL.size:
+    if geometry.size != FULL.size:
         raise CheckpointError(
-            f"strips of size {foreign.strip.size} don't fit AlexNet", f"its first hidden layer takes {FULL.size}"
+            f"patches of size {geometry.size} don't fit AlexNet", f"its first hidden layer takes size {FULL.size}"
         )
-    network = _alexnet(path, weights, FULL)
+    network = _load_alexnet(path, weights, FULL)
     other = classes[1 - classes.index(_LANE)]
-    if classes[0] == _LANE:  # the service reads the lane's probability second
+    if classes[0] == _LANE:  # the service expects the lane's probability second
         last = network.classifier[6]
-        assert isinstance(last, nn.Linear)  # noqa: S101 - tells mypy what AlexNet's constructor says
+        assert isinstance(last, nn.Linear)  # noqa: S101 - for mypy; AlexNet's constructor guarantees it
         last.weight.data, last.bias.data = last.weight.data.flip(0), last.bias.data.flip(0)
-    return ClassifierSubject(network, (other, _LANE), foreign.strip, foreign.normalisation)
+    return ExportableClassifier(network, (other, _LANE), geometry, foreign.normalization)
 
 
-def _alexnet(path: Path, weights: Mapping[str, Tensor], shape: Shape) -> AlexNet:
-    last = weights.get(_LAST)
+def _load_alexnet(path: Path, weights: Mapping[str, Tensor], shape: Shape) -> AlexNet:
+    last = weights.get(_LAST_LAYER)
     if not isinstance(last, Tensor) or last.ndim != 2:
-        raise CheckpointError(f"{path} holds no AlexNet: there is no {_LAST}", "its keys must be torchvision's")
+        raise CheckpointError(f"{path} is not an AlexNet: {_LAST_LAYER} is missing", "use torchvision's key names")
     if len(last) != 2:
         raise CheckpointError(
-            f"{path} tells {len(last)} classes apart, and the service knows two", "fine-tune it with a last layer of 2"
+            f"{path} has {len(last)} classes, but the service needs two", "fine-tune it with a final layer of 2"
         )
     network = AlexNet(shape=shape, normalised=_has_norms(weights))
-    _load(path, network, weights)
+    _load_weights(path, network, weights)
     return network.eval().folded()
 
 
-def _load(path: Path, network: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Takes over `weights` if they fit in every key and shape."""
-    wanted = network.state_dict()
+def _load_weights(path: Path, network: nn.Module, weights: Mapping[str, Tensor]) -> None:
+    """Loads `weights` into `network`. Raises CheckpointError if a key or a shape differs or a value is not finite."""
+    expected = network.state_dict()
     hint = "give a checkpoint of this trainer, or a torchvision AlexNet"
-    for key, value in wanted.items():
+    for key, value in expected.items():
         if key not in weights:
             raise CheckpointError(f"{path} lacks {key}", hint)
         if weights[key].shape != value.shape:
-            shapes = f"{tuple(weights[key].shape)}, not {tuple(value.shape)}"
+            shapes = f"{tuple(weights[key].shape)}, expected {tuple(value.shape)}"
             raise CheckpointError(f"{path}: {key} has the shape {shapes}", hint)
-    if unknown := sorted(weights.keys() - wanted.keys()):
-        raise CheckpointError(f"{path} has {unknown[0]}, which this network lacks", hint)
+    if unknown := sorted(weights.keys() - expected.keys()):
+        raise CheckpointError(f"{path} has {unknown[0]}, which this network does not have", hint)
     network.load_state_dict(dict(weights))
     if not all(bool(torch.isfinite(value).all()) for value in network.state_dict().values()):
-        raise CheckpointError(f"{path} holds weights that are no numbers", "take an earlier checkpoint of the run")
+        raise CheckpointError(f"{path} has weights that are not finite", "use an earlier checkpoint of the run")
 
 
-def _unwrapped(path: Path, state: Mapping[str, Any]) -> Mapping[str, Tensor]:
-    """The weights alone, whatever they are wrapped in; DataParallel's prefix goes."""
-    inner = next((state[key] for key in _WRAPPED if isinstance(state.get(key), Mapping)), state)
+def _unwrap(path: Path, state: Mapping[str, Any]) -> Mapping[str, Tensor]:
+    """Returns the bare weights, without a wrapping key and without the prefix of DataParallel."""
+    inner = next((state[key] for key in _WRAPPER_KEYS if isinstance(state.get(key), Mapping)), state)
     weights = {str(key).removeprefix("module."): value for key, value in inner.items() if isinstance(value, Tensor)}
     if not weights:
-        raise CheckpointError(f"{path} holds no weights", "save the state_dict of the network")
+        raise CheckpointError(f"{path} has no weights", "save the state_dict of the network")
     return weights
 
 
@@ -140,8 +142,8 @@ def _has_norms(weights: Mapping[str, Tensor]) -> bool:
     return any(key.startswith("norms.") for key in weights)
 
 
-def _training(state: Mapping[str, Any]) -> dict[str, Any]:
-    """What the trainer recorded: steps, validation figures, data, configuration, revision."""
+def _training_record(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what the trainer recorded: step, validation figures, data, configuration, revision."""
     record = state.get("record") or {}
-    told = {key: record[key] for key in ("revision", "lanestream", "torch", "data", "config") if key in record}
-    return {"data": "not recorded", **told, "step": state.get("step"), "figures": state.get("figures", {})}
+    known = {key: record[key] for key in ("revision", "lanestream", "torch", "data", "config") if key in record}
+    return {"data": "not recorded", **known, "step": state.get("step"), "figures": state.get("figures", {})}

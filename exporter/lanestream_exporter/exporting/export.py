@@ -1,4 +1,4 @@
-"""From a checkpoint to an ONNX file that describes itself and has proved itself."""
+"""The export: compress, calibrate, write, verify against PyTorch, and publish only a file within the tolerance."""
 
 from __future__ import annotations
 
@@ -13,28 +13,33 @@ from numpy.typing import NDArray
 
 from lanestream.errors import ExportError
 from lanestream.inference import OnnxModel
-from lanestream_exporter.exporting.compression import in_batches
-from lanestream_exporter.exporting.frames import FrameSource
+from lanestream_exporter.exporting.compression import in_batches, quantize
+from lanestream_exporter.exporting.exportable import ExportableNetwork, ExportDescription, Precision, ValidationSet
+from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import describe, publish, write_graph
-from lanestream_exporter.exporting.proof import Boundaries, Measured, boundaries, differences, timed
-from lanestream_exporter.exporting.quantization import quantized
-from lanestream_exporter.exporting.subject import Check, Description, Precision, Subject
+from lanestream_exporter.exporting.proof import (
+    BoundaryComparison,
+    ModelMeasurement,
+    compare_boundaries,
+    differences,
+    time_files,
+)
 
-# The largest differences from PyTorch, (mean, largest), that a file may show in any output. int8 rounds every layer,
-# so there only the mean counts, and the accuracy it costs.
-_TOLERANCES: Final[dict[Precision, tuple[float, float]]] = {
+# The allowed (mean, largest) difference of any output from PyTorch. int8 rounds in every layer, so only its mean is
+# limited, besides the loss of accuracy.
+_MAX_DIFFERENCES: Final[dict[Precision, tuple[float, float]]] = {
     "fp32": (1e-4, 1e-3),
     "fp16": (5e-3, 5e-2),
     "int8": (3e-2, np.inf),
 }
 
-# So many of the inputs that set ranks set int8's ranges, too.
-_RANGES: Final = 256
+# How many of the training inputs set the ranges of int8.
+_RANGE_INPUTS: Final = 256
 
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """What to write: its `name`, the share of the hidden layers' `rank_energy` to keep, its `precision`.
+    """What to write: the model's `name`, the `rank_energy` of the hidden layers to keep, the `precision`.
 
     `tolerance` is how many points of accuracy the file may lose against the checkpoint.
     """
@@ -47,33 +52,35 @@ class ExportSettings:
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was measured on the same validation inputs: the checkpoint in PyTorch, the fp32 file, the written file.
+    """The measurements on the same validation inputs: the checkpoint in PyTorch, the fp32 file, the written file.
 
-    `fp32` is the file of the same compressed network; it is the written one where that was asked for. `timed_by` is the
-    provider that ran the files for their times.
+    `fp32` is the file of the same compressed network, and is the written file itself if the precision is fp32.
+    `timing_provider` is the execution provider that ran the timed files.
     """
 
-    subject: Subject
+    network: ExportableNetwork
     frames: int
     inputs: int
-    checkpoint: Measured
-    fp32: Measured
-    written: Measured
-    boundaries: Boundaries
-    timed_by: str
+    checkpoint: ModelMeasurement
+    fp32: ModelMeasurement
+    written: ModelMeasurement
+    boundaries: BoundaryComparison
+    timing_provider: str
 
     @property
     def lost(self) -> dict[str, float]:
-        """Points of accuracy that the written file loses, by what it is compared with; negative where it gains."""
+        """Returns the points of accuracy that the written file loses, by reference; negative if it gains."""
         return {
-            other.name: max(100.0 * (other.figures[key] - self.written.figures[key]) for key in self.subject.headline)
-            for other in (self.checkpoint, self.fp32)
-            if other is not self.written
+            reference.name: max(
+                100.0 * (reference.metrics[key] - self.written.metrics[key]) for key in self.network.guarded_metrics
+            )
+            for reference in (self.checkpoint, self.fp32)
+            if reference is not self.written
         }
 
     @property
     def time_ratio(self) -> float | None:
-        """The written file's time an input over the fp32 file's; None where they are the same file."""
+        """Returns the written file's time per input over the fp32 file's; None if they are the same file."""
         if self.written is self.fp32 or not self.written.milliseconds or not self.fp32.milliseconds:
             return None
         return self.written.milliseconds / self.fp32.milliseconds
@@ -81,112 +88,118 @@ class ExportReport:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a network and the frames of its export come from, for the file's metadata."""
+    """The training record of a network and the frames of its export, for the file's metadata."""
 
     training: dict[str, Any]
-    source: FrameSource
+    frames: ExportFrames
 
 
 def export_network(
-    subject: Subject, out: Path, settings: ExportSettings, provenance: Provenance, told: Callable[[str], None]
+    network: ExportableNetwork,
+    out: Path,
+    settings: ExportSettings,
+    provenance: Provenance,
+    progress: Callable[[str], None],
 ) -> ExportReport:
-    """Writes `subject` to `out` (.onnx) and returns what it measures; `told` hears of each step.
+    """Writes `network` to `out` (.onnx) and returns the measurements; calls `progress` with a line for each step.
 
-    Training frames choose what the hidden layers keep and set the ranges of int8; validation frames set temperature and
-    threshold and prove the file. Raises LabelError for frames that can't be used, and ExportError where the file misses
-    the tolerance; then nothing is written.
+    Training frames determine the truncation of the hidden layers and the ranges of int8; validation frames determine
+    temperature and threshold and verify the file. Raises LabelError for unusable frames, and ExportError, without
+    writing anything, if the file misses the tolerance.
     """
-    told(f"preparing {provenance.source.origin}")
-    ranging = subject.ranging(provenance.source)
-    check = subject.check(provenance.source)
-    told(
-        f"compressing and calibrating with {len(ranging)} inputs of training frames, {len(check.inputs)} of validation"
+    frames = provenance.frames
+    progress(f"preparing {frames.origin}")
+    training_inputs = network.training_inputs(frames)
+    validation = network.validation_set(frames)
+    progress(
+        f"compressing and calibrating with {len(training_inputs)} inputs from training frames and "
+        f"{len(validation.inputs)} from validation frames"
     )
-    whole = subject
-    subject = subject.compressed(settings.rank_energy, ranging).calibrated(check)
+    original = network
+    network = network.compressed(settings.rank_energy, training_inputs).calibrated(validation)
+    training = {**provenance.training, "rank_energy": settings.rank_energy, "export_frames": frames.origin}
     with tempfile.TemporaryDirectory() as folder:
-        told(f"writing {settings.precision}")
-        files = _files(subject, settings.precision, ranging[:_RANGES], Path(folder))
-        description = Description(settings.name, settings.precision, _training(settings, provenance), {})
+        progress(f"writing {settings.precision}")
+        files = _write_files(network, settings.precision, training_inputs[:_RANGE_INPUTS], Path(folder))
         for path in files.values():
-            describe(path, subject.info(description))
-        told("proving it")
-        report = _measured(whole, subject, check, files)
-        _refuse(report, settings)
-        metrics = _metrics(report, provenance.source)
-        final = Description(settings.name, settings.precision, description.training, metrics)
-        describe(files[settings.precision], subject.info(final))
-        publish(files[settings.precision], out)
+            describe(path, network.info(ExportDescription(settings.name, settings.precision, training, {})))
+        progress("verifying")
+        report = _measure(original, network, validation, files)
+        _check_tolerance(report, settings)
+        metrics = _metadata_metrics(report, frames)
+        finished = files[settings.precision]
+        describe(finished, network.info(ExportDescription(settings.name, settings.precision, training, metrics)))
+        publish(finished, out)
     return report
 
 
-def _files(subject: Subject, precision: Precision, ranging: NDArray[np.uint8], folder: Path) -> dict[Precision, Path]:
-    """The fp32 file, which the others are measured against, and the one of `precision`."""
+def _write_files(
+    network: ExportableNetwork, precision: Precision, inputs: NDArray[np.uint8], folder: Path
+) -> dict[Precision, Path]:
+    """Writes the fp32 file, the reference for the others, and the file of `precision`."""
     files: dict[Precision, Path] = {name: folder / f"{name}.onnx" for name in ("fp32", precision)}
-    names = subject.input_name, subject.output_name
-    write_graph(subject.served(), ranging, files["fp32"], names)
+    names = network.input_name, network.output_name
+    write_graph(network.serving_module(), inputs, files["fp32"], names)
     if precision == "fp16":
-        write_graph(subject.served(half=True), ranging, files["fp16"], names)
+        write_graph(network.serving_module(half=True), inputs, files["fp16"], names)
     if precision == "int8":
-        quantized(files["fp32"], files["int8"], ranging, subject.exact)
+        quantize(files["fp32"], files["int8"], inputs, network.fp32_layers)
     return files
 
 
-def _training(settings: ExportSettings, provenance: Provenance) -> dict[str, Any]:
-    return {**provenance.training, "rank_energy": settings.rank_energy, "export_frames": provenance.source.origin}
-
-
-def _measured(whole: Subject, subject: Subject, check: Check, files: dict[Precision, Path]) -> ExportReport:
-    served = subject.served()
-    expected = in_batches(served, check.inputs).numpy()
-    # The checkpoint as it is, but with the same temperature and threshold: they are the file's, not the network's.
-    checkpoint = in_batches(whole.under(subject.calibration).served(), check.inputs).numpy()
-    times = timed({str(name): path for name, path in files.items()}, check.inputs)
-    rows: dict[str, Measured] = {}
+def _measure(
+    original: ExportableNetwork, network: ExportableNetwork, validation: ValidationSet, files: dict[Precision, Path]
+) -> ExportReport:
+    expected = in_batches(network.serving_module(), validation.inputs).numpy()
+    # The uncompressed checkpoint gets the same temperature and threshold, which belong to the file.
+    checkpoint = original.with_calibration(network.calibration).serving_module()
+    checkpoint_metrics = network.metrics(in_batches(checkpoint, validation.inputs).numpy(), validation)
+    times = time_files({str(name): path for name, path in files.items()}, validation.inputs)
+    measured: dict[str, ModelMeasurement] = {}
     for name, path in files.items():
-        outputs, mean, largest = differences(OnnxModel.load(path, "cpu"), check, expected)
-        figures = subject.figures(outputs, check)
-        rows[name] = Measured(name, figures, mean, largest, path.stat().st_size, times.milliseconds[name])
+        outputs, mean, largest = differences(OnnxModel.load(path, "cpu"), validation, expected)
+        metrics = network.metrics(outputs, validation)
+        size, milliseconds = path.stat().st_size, times.milliseconds[name]
+        measured[name] = ModelMeasurement(name, metrics, mean, largest, size, milliseconds)
     return ExportReport(
-        subject,
-        check.frames,
-        len(check.inputs),
-        Measured("checkpoint", subject.figures(checkpoint, check)),
-        rows["fp32"],
-        rows[name],
-        boundaries(subject.detector, check, expected, outputs),
+        network,
+        validation.frames,
+        len(validation.inputs),
+        ModelMeasurement("checkpoint", checkpoint_metrics),
+        measured["fp32"],
+        measured[name],  # the loop ends with the written file
+        compare_boundaries(network.detector, validation, expected, outputs),
         times.provider,
     )
 
 
-def _refuse(report: ExportReport, settings: ExportSettings) -> None:
-    """Raises ExportError where the file differs too much from PyTorch, or loses too much of the checkpoint."""
+def _check_tolerance(report: ExportReport, settings: ExportSettings) -> None:
+    """Raises ExportError if the file differs too much from PyTorch or loses too much accuracy."""
     hint = _hint(settings)
     written = report.written
-    mean, largest = _TOLERANCES[settings.precision]
-    # Written so that what is no number is refused, too.
+    mean, largest = _MAX_DIFFERENCES[settings.precision]
+    # The negated comparisons also refuse NaN.
     if not (written.mean_difference <= mean and written.largest_difference <= largest):
         raise ExportError(
             f"the {settings.precision} file differs from PyTorch by {written.mean_difference:.5f} on average and "
-            f"{written.largest_difference:.5f} at most, {mean:g} and {largest:g} are allowed",
+            f"{written.largest_difference:.5f} at most; {mean:g} and {largest:g} are allowed",
             hint,
         )
     for name, lost in report.lost.items():
         if not lost <= settings.tolerance:
             raise ExportError(
-                f"the {settings.precision} file loses {lost:.2f} points of accuracy against {name}, "
+                f"the {settings.precision} file loses {lost:.2f} points of accuracy against {name}; "
                 f"{settings.tolerance:g} are allowed",
                 hint,
             )
 
 
 def _hint(settings: ExportSettings) -> str:
-    """What to try instead."""
-    tries = [] if settings.rank_energy >= 1.0 else ["a --rank-energy nearer to 1"]
-    tries += [] if settings.precision == "fp32" else ["--precision fp16 or fp32"]
-    return f"try {' or '.join(tries)}, or allow more with --tolerance" if tries else "allow more with --tolerance"
+    options = [] if settings.rank_energy >= 1.0 else ["a --rank-energy closer to 1"]
+    options += [] if settings.precision == "fp32" else ["--precision fp16 or fp32"]
+    return f"try {' or '.join(options)}, or allow more with --tolerance" if options else "allow more with --tolerance"
 
 
-def _metrics(report: ExportReport, source: FrameSource) -> dict[str, Any]:
-    told = {name: round(value, 4) for name, value in report.written.figures.items() if np.isfinite(value)}
-    return {"frames": f"validation: {source.origin}", "frame_count": report.frames, "inputs": report.inputs, **told}
+def _metadata_metrics(report: ExportReport, frames: ExportFrames) -> dict[str, Any]:
+    metrics = {name: round(value, 4) for name, value in report.written.metrics.items() if np.isfinite(value)}
+    return {"frames": f"validation: {frames.origin}", "frame_count": report.frames, "inputs": report.inputs, **metrics}

@@ -1,4 +1,4 @@
-"""Frames that an export works with: those that set ranges and ranks, and those that calibrate and prove the file."""
+"""The frames that an export uses: training frames for ranks and ranges, validation frames for calibration and proof."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.training.config import PatchData
 from lanestream_exporter.training.ownframes import own_frames
 
-# No test frame has a part in an export.
+# An export never uses test frames.
 Part = Literal["train", "val"]
 
 T = TypeVar("T")
 
-# Rendered frames are seeded apart from those that networks are trained on.
+# Seed of the rendered frames, different from the seeds of rendered training data.
 _SEED: Final = 7001
 _SIZES: Final = ((640, 360), (640, 480), (960, 540))
 _JPEG: Final = (cv2.IMWRITE_JPEG_QUALITY, 95)
 
 
 @dataclass(frozen=True)
-class LabelledJpeg:
-    """A frame as a client would send it, and its labels."""
+class LabeledJpeg:
+    """A frame as a client would send it, with its labels."""
 
     jpeg: bytes
     labels: LabelledFrame
 
 
 @dataclass(frozen=True)
-class FrameSource:
-    """Rendered frames, `rendered` of each part, and labelled real ones: those of `own`, or the project's below `root`.
+class ExportFrames:
+    """Rendered frames, `rendered` per part, and labeled real frames: those of `own`, or the project's under `root`.
 
-    At most `real` real ones of a part are taken, evenly among all.
+    At most `real` real frames per part are used, evenly spaced among all.
     """
 
     root: Path | None
@@ -51,24 +51,24 @@ class FrameSource:
 
     @property
     def origin(self) -> str:
-        """Where the frames come from, for people."""
+        """Returns a description of where the frames come from."""
         if self.own is not None:
             return f"rendered scenes and real frames of {', '.join(frames.path for frames in self.own.train)}"
         return "rendered scenes" if self.root is None else "rendered scenes and the project's real frames"
 
-    def jpegs(self, part: Part) -> list[LabelledJpeg]:
-        """Whole frames of `part` as JPEG files. Raises LabelError for real frames that can't be read."""
-        rendered = [LabelledJpeg(_jpeg(image), labels) for labels, image, _ in self._rendered(part)]
-        real = [LabelledJpeg(_jpeg(image), labels) for labels, image in self._labelled(part)]
-        return [*_thinned(real, self.real), *rendered]
+    def jpegs(self, part: Part) -> list[LabeledJpeg]:
+        """Returns full frames of `part` as JPEG files. Raises LabelError for unreadable real frames."""
+        rendered = [LabeledJpeg(_encode(image), labels) for labels, image, _ in self._rendered(part)]
+        real = [LabeledJpeg(_encode(image), labels) for labels, image in self._real(part)]
+        return [*_evenly_spaced(real, self.real), *rendered]
 
-    def roads(self, part: Part) -> list[RoadFrame]:
-        """Frames of `part` with their horizon, small. Raises LabelError for real frames that can't be read."""
+    def road_frames(self, part: Part) -> list[RoadFrame]:
+        """Returns downscaled frames of `part` with known horizons. Raises LabelError for unreadable real frames."""
         rendered = [RoadFrame.of(labels, image, horizon) for labels, image, horizon in self._rendered(part)]
-        real = _thinned(road_frames(self._labelled(part)), self.real)
+        real = _evenly_spaced(road_frames(self._real(part)), self.real)
         return [*real, *(frame for frame in rendered if frame is not None)]
 
-    def _labelled(self, part: Part) -> Iterator[tuple[LabelledFrame, Image]]:
+    def _real(self, part: Part) -> Iterator[tuple[LabelledFrame, Image]]:
         if self.own is not None:
             return own_frames(self.own)[0 if part == "train" else 1]
         return iter(()) if self.root is None else real_frames(self.root, part)
@@ -80,9 +80,9 @@ class FrameSource:
             yield still.labels, still.image, still.horizon
 
 
-def _thinned(items: list[T], most: int) -> list[T]:
-    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).astype(int))]
+def _evenly_spaced(items: list[T], limit: int) -> list[T]:
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(limit, len(items))).astype(int))]
 
 
-def _jpeg(image: Image) -> bytes:
+def _encode(image: Image) -> bytes:
     return cv2.imencode(".jpg", image, _JPEG)[1].tobytes()

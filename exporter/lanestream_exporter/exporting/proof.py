@@ -1,4 +1,4 @@
-"""Proving a file: the same JPEG files through PyTorch and through the file, by the service's own code."""
+"""Verification of an exported file: the same JPEG frames through PyTorch and through the file, by the service code."""
 
 from __future__ import annotations
 
@@ -16,28 +16,29 @@ from lanestream.inference import OnnxModel, load_model
 from lanestream.inference.providers import offered, without_gpus
 from lanestream.road.results import Detection
 from lanestream.runtime import RuntimeOptions
-from lanestream_exporter.exporting.subject import Check, Figures
+from lanestream_exporter.exporting.exportable import MetricValues, ValidationSet
 
-BATCHES: Final = (1, 4, 16)
+BATCH_SIZES: Final = (1, 4, 16)
 
-# Batches below the largest are tried with this many of the inputs, spread over all of them.
-_FEW: Final = 64
+# The smaller batch sizes are tested with this many inputs, evenly spaced among all.
+_SUBSET: Final = 64
+_WARMUP_ROUNDS: Final = 2
 _ROUNDS: Final = 15
 
-# Boundaries of one frame that are farther apart, in pixels of a 640 pixel wide image, are not the same one.
-_SAME: Final = 15.0
-_WIDE: Final = 640.0
+# Detections farther apart than this, in pixels of a 640 pixel wide image, are different boundaries.
+_MAX_MATCH_DISTANCE: Final = 15.0
+_REFERENCE_WIDTH: Final = 640.0
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A network on the check's inputs: how good it is, how far its outputs are from PyTorch's, its size and time.
+class ModelMeasurement:
+    """A model on the validation inputs: its metrics, the differences of its outputs from PyTorch's, its size and time.
 
-    `size` in bytes and `milliseconds` an input, in batches of 16, are those of a file; None for PyTorch itself.
+    `size` in bytes and `milliseconds` per input, in batches of 16, belong to a file; both are None for PyTorch itself.
     """
 
     name: str
-    figures: Figures
+    metrics: MetricValues
     mean_difference: float = 0.0
     largest_difference: float = 0.0
     size: int | None = None
@@ -45,86 +46,95 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Boundaries:
-    """Boundaries found by way of PyTorch and by way of the file in the same frames.
+class BoundaryComparison:
+    """The boundaries detected with PyTorch's outputs compared with those detected with the file's.
 
-    `both` were found by both, their columns differing by `mean` and at most by `largest` pixels of a 640 pixel wide
-    image; `alone` by one of them only.
+    `matched` is the number found with both, whose columns differ by `mean` on average and `largest` at most, in pixels
+    of a 640 pixel wide image; `unmatched` is the number found with only one of them.
     """
 
-    both: int
-    alone: int
+    matched: int
+    unmatched: int
     mean: float
     largest: float
 
 
-def outputs_of(model: OnnxModel, inputs: NDArray[np.uint8], batch: int = BATCHES[-1]) -> NDArray[np.float32]:
-    """What `model` answers (N, outputs) when it is asked about `batch` inputs at a time."""
+def run_in_batches(model: OnnxModel, inputs: NDArray[np.uint8], batch: int = BATCH_SIZES[-1]) -> NDArray[np.float32]:
+    """Runs `model` on `inputs` with the given batch size and returns its outputs (N, outputs)."""
     return np.concatenate([model.run(inputs[i : i + batch]) for i in range(0, len(inputs), batch)])
 
 
 def differences(
-    model: OnnxModel, check: Check, expected: NDArray[np.float32]
+    model: OnnxModel, validation: ValidationSet, expected: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], float, float]:
-    """The file's outputs (N, outputs), and their mean and largest difference from PyTorch's at all batch sizes."""
-    outputs = outputs_of(model, check.inputs)
-    few = np.unique(np.linspace(0, len(check.inputs) - 1, min(_FEW, len(check.inputs))).astype(int))
-    by_batch = [np.abs(outputs_of(model, check.inputs[few], batch) - expected[few]) for batch in BATCHES[:-1]]
-    all_at_most = np.abs(outputs - expected)
-    return outputs, float(all_at_most.mean()), float(max(part.max() for part in (all_at_most, *by_batch)))
+    """Returns the model's outputs (N, outputs), and their mean and largest difference from `expected`.
+
+    The largest difference is over all batch sizes.
+    """
+    inputs = validation.inputs
+    outputs = run_in_batches(model, inputs)
+    subset = np.unique(np.linspace(0, len(inputs) - 1, min(_SUBSET, len(inputs))).astype(int))
+    smaller = [np.abs(run_in_batches(model, inputs[subset], batch) - expected[subset]) for batch in BATCH_SIZES[:-1]]
+    difference = np.abs(outputs - expected)
+    return outputs, float(difference.mean()), float(max(part.max() for part in (difference, *smaller)))
 
 
-def boundaries(
-    detector: Detector, check: Check, expected: NDArray[np.float32], outputs: NDArray[np.float32]
-) -> Boundaries:
-    """What two networks' outputs for the frames of `check` make of them, compared."""
-    gaps: list[NDArray[np.float64]] = []
-    alone = 0
-    frames = zip(check.prepared, check.by_frame(expected), check.by_frame(outputs), strict=True)
-    for prepared, one, other in frames:
-        mine, theirs = (detector.finish(prepared, part).detections for part in (one, other))
-        found = _paired(mine, theirs, _WIDE / prepared.view.width)
-        gaps += found
-        alone += len(mine) + len(theirs) - 2 * len(found)
-    apart = np.concatenate(gaps) if gaps else np.zeros(1)
-    return Boundaries(len(gaps), alone, float(apart.mean()), float(apart.max()))
+def compare_boundaries(
+    detector: Detector, validation: ValidationSet, expected: NDArray[np.float32], outputs: NDArray[np.float32]
+) -> BoundaryComparison:
+    """Compares the boundaries that `detector` finds with two networks' outputs for the validation frames."""
+    distances: list[NDArray[np.float64]] = []
+    unmatched = 0
+    frames = zip(
+        validation.prepared, validation.split_by_frame(expected), validation.split_by_frame(outputs), strict=True
+    )
+    for prepared, *parts in frames:
+        first, second = (detector.finish(prepared, part).detections for part in parts)
+        matched = _match(first, second, _REFERENCE_WIDTH / prepared.view.width)
+        distances += matched
+        unmatched += len(first) + len(second) - 2 * len(matched)
+    values = np.concatenate(distances) if distances else np.zeros(1)
+    return BoundaryComparison(len(distances), unmatched, float(values.mean()), float(values.max()))
 
 
-def _paired(one: Sequence[Detection], other: Sequence[Detection], scale: float) -> list[NDArray[np.float64]]:
-    """Columns' distances along each boundary of `one` that `other` has too, in pixels of a 640 pixel wide image."""
-    pairs, left = [], list(other)
-    for detection in one:
+def _match(first: Sequence[Detection], second: Sequence[Detection], scale: float) -> list[NDArray[np.float64]]:
+    """Matches each detection of `first` to the nearest remaining one of `second`; returns the distances along each.
+
+    `scale` converts pixels to those of a 640 pixel wide image.
+    """
+    matched, remaining = [], list(second)
+    for detection in first:
         rows = np.linspace(detection.top, detection.bottom, 16)
-        gaps = [scale * np.abs(detection.curve.x(rows) - candidate.curve.x(rows)) for candidate in left]
-        if gaps:
-            nearest = min(range(len(gaps)), key=lambda i: float(gaps[i].mean()))
-            if gaps[nearest].mean() <= _SAME:
-                pairs.append(gaps[nearest])
-                left.pop(nearest)
-    return pairs
+        distances = [scale * np.abs(detection.curve.x(rows) - other.curve.x(rows)) for other in remaining]
+        if distances:
+            nearest = min(range(len(distances)), key=lambda i: float(distances[i].mean()))
+            if distances[nearest].mean() <= _MAX_MATCH_DISTANCE:
+                matched.append(distances[nearest])
+                remaining.pop(nearest)
+    return matched
 
 
 @dataclass(frozen=True)
-class Times:
-    """Milliseconds an input of each file, and the `provider` that they are of."""
+class InferenceTimes:
+    """Milliseconds per input of each file, and the `provider` that ran them."""
 
     provider: str
     milliseconds: Mapping[str, float]
 
 
-def timed(paths: Mapping[str, Path], inputs: NDArray[np.uint8]) -> Times:
-    """The time of each file as the service runs it on the CPU: the median over batches of 16, the files taking turns.
+def time_files(paths: Mapping[str, Path], inputs: NDArray[np.uint8]) -> InferenceTimes:
+    """Times each file as the service runs it on the CPU: the median over batches of 16, the files interleaved.
 
-    Whatever else the machine does slows all of them alike, so that their ratio holds where the numbers don't.
+    Other load on the machine slows all files equally, so that their ratio holds even if the times do not.
     """
-    batch = np.resize(inputs[: BATCHES[-1]], (BATCHES[-1], *inputs.shape[1:]))
-    options, offer = RuntimeOptions(threads=1), without_gpus(offered())
-    models = {name: load_model(path, "auto", options, offer) for name, path in paths.items()}
-    taken: dict[str, list[float]] = {name: [] for name in models}
-    for _ in range(_ROUNDS + 2):
+    batch = np.resize(inputs[: BATCH_SIZES[-1]], (BATCH_SIZES[-1], *inputs.shape[1:]))
+    options, providers = RuntimeOptions(threads=1), without_gpus(offered())
+    models = {name: load_model(path, "auto", options, providers) for name, path in paths.items()}
+    times: dict[str, list[float]] = {name: [] for name in models}
+    for _ in range(_WARMUP_ROUNDS + _ROUNDS):
         for name, model in models.items():
             started = time.perf_counter()
             model.run(batch)
-            taken[name].append(1e3 * (time.perf_counter() - started) / len(batch))
+            times[name].append(1e3 * (time.perf_counter() - started) / len(batch))
     provider = next(iter(models.values())).provider
-    return Times(provider, {name: float(np.median(times[2:])) for name, times in taken.items()})
+    return InferenceTimes(provider, {name: float(np.median(t[_WARMUP_ROUNDS:])) for name, t in times.items()})

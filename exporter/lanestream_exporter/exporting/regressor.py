@@ -1,4 +1,4 @@
-"""Exporting the regressor: canonical pictures in, what `detection.regression.RegressorOutput` reads out."""
+"""Export of the regressor: road crops in, the layout that `detection.regression_detector.RegressorOutput` reads out."""
 
 from __future__ import annotations
 
@@ -18,29 +18,33 @@ from lanestream.detection.regression_detector import RegressionDetector, RoadCro
 from lanestream.images.decoding import ImageLimits, decode
 from lanestream.inference import RegressorInfo, RoadCropInfo
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.exporting.calibration import Calibration, calibrated
-from lanestream_exporter.exporting.compression import in_batches, truncated
-from lanestream_exporter.exporting.frames import FrameSource
-from lanestream_exporter.exporting.normalisation import contrast
-from lanestream_exporter.exporting.subject import Check, Description, Figures
-from lanestream_exporter.exporting.versions import exporter
+from lanestream_exporter.exporting.compression import in_batches, truncate_layers
+from lanestream_exporter.exporting.exportable import (
+    Calibration,
+    ExportDescription,
+    MetricValues,
+    ValidationSet,
+    fit_calibration,
+)
+from lanestream_exporter.exporting.frames import ExportFrames
+from lanestream_exporter.exporting.graph import contrast, exporter_versions
 from lanestream_exporter.regressor import Answer, LaneRegressor
 from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
 from lanestream_exporter.samples.road_frames import RoadFrame
 
-_MOST_RANGING: Final = 1024
-_WARPS: Final = 5
+_MAX_TRAINING_INPUTS: Final = 1024
+_WARPS_PER_FRAME: Final = 5
 
-# Where errors are told: about 10 m and 30 m ahead of a camera at the height of a car's mirror.
+# The shares of the row offset at which errors are reported: about 10 m and 30 m ahead of a camera at mirror height.
 _NEAR, _FAR = SHARES.index(0.37), SHARES.index(0.12)
 
 # A column is right within 5 pixels of a 640 pixel wide image.
-_WIDE: Final = 640.0
-_RIGHT: Final = 5.0
+_REFERENCE_WIDTH: Final = 640.0
+_MAX_ERROR: Final = 5.0
 
 
 class ServedRegressor(nn.Module):
-    """The graph: uint8 RGB canvases (N, H, W, 3) in, the layout of `RegressorOutput` (N, 15) out."""
+    """The module to export: uint8 RGB road crops (N, H, W, 3) in, the layout of `RegressorOutput` (N, 15) out."""
 
     def __init__(self, network: LaneRegressor, temperature: float, half: bool = False) -> None:
         super().__init__()
@@ -48,46 +52,45 @@ class ServedRegressor(nn.Module):
         self.dtype = torch.float16 if half else torch.float32
         self.temperature = temperature
 
-    def forward(self, canvases: Tensor) -> Tensor:
-        """Only the network itself is ever in half precision."""
-        answer = Answer.of(self.network(contrast(canvases).to(self.dtype)).float())
+    def forward(self, road_crops: Tensor) -> Tensor:
+        """Returns the served outputs; only the network itself may run in half precision."""
+        answer = Answer.of(self.network(contrast(road_crops).to(self.dtype)).float())
         return replace(answer, presence=answer.presence / self.temperature).told()
 
 
 @dataclass(frozen=True)
-class RegressorSubject:
-    """A regressor without normalisation layers."""
+class ExportableRegressor:
+    """A regressor without batch normalization layers."""
 
     network: LaneRegressor
     calibration: Calibration = Calibration()
 
-    name = "lanestream-regressor"
-    input_name = "canvases"
+    default_name = "lanestream-regressor"
+    input_name = "road_crops"
     output_name = "readings"
-    # Few weights and little time, but every output hangs on them, on a thousandth of an image's width.
-    exact = ("network.features.0.", "network.hidden.", "network.shape.", "network.doubts.")
-    rank_energy = 0.99996
-    headline = ("accuracy", "presence_accuracy")
+    # These layers have few weights and take little time, but every output depends on them to a thousandth of the width.
+    fp32_layers = ("network.features.0.", "network.hidden.", "network.shape.", "network.doubts.")
+    default_rank_energy = 0.99996
+    guarded_metrics = ("accuracy", "presence_accuracy")
 
     @property
     def detector(self) -> RegressionDetector:
-        """The detector that will ask the file."""
+        """Returns the detector that will run the file."""
         return RegressionDetector(self.calibration.threshold, RoadCropGeometry(self.network.size.size))
 
-    def ranging(self, source: FrameSource) -> NDArray[np.uint8]:
-        """Canvases (N, size, size, 3) of training frames, as they are and as other cameras would see them."""
+    def training_inputs(self, frames: ExportFrames) -> NDArray[np.uint8]:
+        """Returns road crops (N, size, size, 3) of training frames, as they are and warped to other cameras."""
         rng = np.random.default_rng(0)
         geometry = self.detector.geometry
-        canvases = [
-            sample(frame, geometry, warp)[0] for frame in source.roads("train") for warp in _warps(frame, rng)
-        ]  # fmt: skip
-        return np.stack([canvases[i] for i in rng.permutation(len(canvases))[:_MOST_RANGING]])
+        road_frames = frames.road_frames("train")
+        crops = [sample(frame, geometry, warp)[0] for frame in road_frames for warp in _warps(frame, rng)]
+        return np.stack([crops[i] for i in rng.permutation(len(crops))[:_MAX_TRAINING_INPUTS]])
 
-    def check(self, source: FrameSource) -> Check:
-        """Validation frames, each with its horizon known and not known. Raises LabelError."""
+    def validation_set(self, frames: ExportFrames) -> ValidationSet:
+        """Returns validation frames, each prepared with a known and with an unknown horizon. Raises LabelError."""
         prepared, targets = [], []
-        frames = source.roads("val")
-        for frame in frames:
+        road_frames = frames.road_frames("val")
+        for frame in road_frames:
             image = decode(frame.jpeg, ImageLimits())
             target = sample(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
             for horizon in (frame.horizon, None):
@@ -95,76 +98,75 @@ class RegressorSubject:
                 targets.append((target.columns, target.known, target.presence, frame.horizon))
         names = ("columns", "known", "presence", "horizon")
         truth = {name: np.array(values) for name, values in zip(names, zip(*targets, strict=True), strict=True)}
-        return Check(len(frames), tuple(prepared), truth)
+        return ValidationSet(len(road_frames), tuple(prepared), truth)
 
-    def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> RegressorSubject:
-        """With a thinner hidden layer."""
+    def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> ExportableRegressor:
+        """Returns the network with a truncated hidden layer."""
         small = copy.deepcopy(self.network)
-        seen = in_batches(lambda part: torch.flatten(small.features(contrast(part)), 1), inputs)
-        small.hidden = truncated(small.hidden, seen, energy)
+        features = in_batches(lambda part: torch.flatten(small.features(contrast(part)), 1), inputs)
+        small.hidden = truncate_layers(small.hidden, features, energy)
         return replace(self, network=small)
 
-    def calibrated(self, check: Check) -> RegressorSubject:
-        """With a temperature and a threshold of presence, where the labels tell presence and absence."""
-        bare = in_batches(self.under(Calibration()).served(), check.inputs).numpy()
-        presence, truth = self._read(bare, check)[1], check.truth["presence"]
-        told = logit(np.clip(presence[truth >= 0.0], 1e-6, 1.0 - 1e-6))
-        pairs = np.stack([np.zeros_like(told), told], axis=1).astype(np.float32)
-        return self.under(calibrated(pairs, truth[truth >= 0.0].astype(np.int64)))
+    def calibrated(self, validation: ValidationSet) -> ExportableRegressor:
+        """Returns the network with temperature and threshold of presence fitted where the labels define presence."""
+        uncalibrated = self.with_calibration(Calibration()).serving_module()
+        presence = self._read(in_batches(uncalibrated, validation.inputs).numpy(), validation)[1]
+        truth = validation.truth["presence"]
+        logits = logit(np.clip(presence[truth >= 0.0], 1e-6, 1.0 - 1e-6))
+        pairs = np.stack([np.zeros_like(logits), logits], axis=1).astype(np.float32)
+        return self.with_calibration(fit_calibration(pairs, truth[truth >= 0.0].astype(np.int64)))
 
-    def under(self, calibration: Calibration) -> RegressorSubject:
-        """With a temperature and a threshold."""
+    def with_calibration(self, calibration: Calibration) -> ExportableRegressor:
+        """Returns the network with the given temperature and threshold."""
         return replace(self, calibration=calibration)
 
-    def served(self, half: bool = False) -> ServedRegressor:
-        """The graph; `half`: its network in float16."""
+    def serving_module(self, half: bool = False) -> ServedRegressor:
+        """Returns the module to export; `half`: its network in float16."""
         return ServedRegressor(self.network, self.calibration.temperature, half).eval()
 
-    def figures(self, outputs: NDArray[np.float32], check: Check) -> Figures:
-        """Shares of right columns and presences, and mean lateral errors in pixels of a 640 pixel wide image."""
-        columns, told_presence = self._read(outputs, check)
-        error = _WIDE * np.abs(columns - check.truth["columns"])
-        labelled = check.truth["known"] >= 1.0
-        presence = check.truth["presence"]
-        told = presence >= 0.0
-        there = told_presence >= self.calibration.threshold
+    def metrics(self, outputs: NDArray[np.float32], validation: ValidationSet) -> MetricValues:
+        """Returns the shares of right columns and presences, and mean lateral errors in pixels at 640 wide."""
+        columns, presence = self._read(outputs, validation)
+        error = _REFERENCE_WIDTH * np.abs(columns - validation.truth["columns"])
+        labeled = validation.truth["known"] >= 1.0
+        true_presence = validation.truth["presence"]
+        defined = true_presence >= 0.0
+        accepted = presence >= self.calibration.threshold
         return {
-            "accuracy": _mean(error[labelled] <= _RIGHT),
-            "presence_accuracy": _mean((there == (presence > 0.0))[told]),
-            "error_near_px": _mean(error[:, :, _NEAR][labelled[:, :, _NEAR]]),
-            "error_far_px": _mean(error[:, :, _FAR][labelled[:, :, _FAR]]),
+            "accuracy": _mean(error[labeled] <= _MAX_ERROR),
+            "presence_accuracy": _mean((accepted == (true_presence > 0.0))[defined]),
+            "error_near_px": _mean(error[:, :, _NEAR][labeled[:, :, _NEAR]]),
+            "error_far_px": _mean(error[:, :, _FAR][labeled[:, :, _FAR]]),
         }
 
-    def info(self, description: Description) -> RegressorInfo:
-        """What the file says of itself."""
+    def info(self, description: ExportDescription) -> RegressorInfo:
+        """Returns the metadata of the file."""
         detector = self.detector
-        canvas = RoadCropInfo(
-            size=detector.geometry.size,
-            above=detector.geometry.above,
-            narrowest=detector.geometry.narrowest,
-            detail_width=detector.detail_width,
-        )
-        training = {**description.training, "presence_temperature": round(self.calibration.temperature, 4)}
         return RegressorInfo(
             kind="regressor",
             name=description.name,
             version=__version__,
-            canvas=canvas,
+            canvas=RoadCropInfo(
+                size=detector.geometry.size,
+                above=detector.geometry.above,
+                narrowest=detector.geometry.narrowest,
+                detail_width=detector.detail_width,
+            ),
             threshold=self.calibration.threshold,
             precision=description.precision,
-            training=training,
+            training={**description.training, "presence_temperature": round(self.calibration.temperature, 4)},
             metrics=description.metrics,
-            exporter=exporter(),
+            exporter=exporter_versions(),
         )
 
-    def _read(self, outputs: NDArray[np.float32], check: Check) -> tuple[FloatArray, FloatArray]:
-        """What the detector reads in outputs: columns (P, 2, S) at `SHARES` of the true depth, presence (P, 2).
+    def _read(self, outputs: NDArray[np.float32], validation: ValidationSet) -> tuple[FloatArray, FloatArray]:
+        """Returns what the detector reads from outputs for P prepared frames.
 
-        Columns are in image widths from the middle; P counts the prepared frames.
+        Columns (P, 2, S) at `SHARES` of the true row offset, in image widths from the center; presence (P, 2).
         """
         columns, presence = [], []
-        frames = zip(check.prepared, check.by_frame(outputs), check.truth["horizon"], strict=True)
-        for prepared, part, horizon in frames:
+        parts = validation.split_by_frame(outputs)
+        for prepared, part, horizon in zip(validation.prepared, parts, validation.truth["horizon"], strict=True):
             reading, view = self.detector.read(prepared, part)
             rows = horizon + np.array(SHARES) * (view.bottom - horizon)
             x = np.stack([reading.curve(side, view).x(rows) for side in (0, 1)])
@@ -176,7 +178,7 @@ class RegressorSubject:
 def _warps(frame: RoadFrame, rng: np.random.Generator) -> Iterator[Warp]:
     yield plain_warp(frame, known=True)
     yield plain_warp(frame, known=False)
-    for _ in range(_WARPS):
+    for _ in range(_WARPS_PER_FRAME):
         yield Warp.drawn(rng)
 
 

@@ -1,88 +1,97 @@
-"""Clips: a scene and how the vehicle and the traffic move through it."""
+"""Clips: a scene with moving vehicles, sampled, rendered and written as a video with labels."""
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
 
+import av
 import numpy as np
+from av.video.stream import VideoStream
 
 from lanestream_exporter.scenes.lens import Lens
-from lanestream_exporter.scenes.light import Air
+from lanestream_exporter.scenes.light import Atmosphere
+from lanestream_exporter.scenes.projection import REACH
 from lanestream_exporter.scenes.random_sampler import RandomSampler
 from lanestream_exporter.scenes.render import RenderedFrame, render_still
 from lanestream_exporter.scenes.road import Pose
-from lanestream_exporter.scenes.sampling import STYLES, Weather, compose_scene, sample_weather
-from lanestream_exporter.scenes.view import REACH
+from lanestream_exporter.scenes.scene import STYLES, Weather, compose_scene, sample_weather
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from pathlib import Path
 
-    from lanestream_exporter.scenes.layout import Style
+    from lanestream_exporter.datasets.labels import LabelledFrame
+    from lanestream_exporter.scenes.layout import RoadStyle
     from lanestream_exporter.scenes.scene import Scene
     from lanestream_exporter.scenes.traffic import Vehicle
 
-SPEEDS: dict[Style, tuple[float, float]] = {  # metres a second
+ENCODERS = ("libx264", "libopenh264", "mpeg4")  # by preference; not every build of FFmpeg has all of them
+ProgressCallback = Callable[[int, int], None]  # (frames done, total frames)
+
+SPEEDS: dict[RoadStyle, tuple[float, float]] = {  # meters per second
     "highway": (22.0, 31.0),
     "country": (13.0, 22.0),
     "street": (7.0, 13.0),
     "lane": (7.0, 13.0),
 }
-CHANGE_TIME = 4.0  # seconds a lane change takes
-FAIR_CLOUDS = 0.35  # share of the sky on a fair day, at most
-CLEAR_AHEAD = 6.0  # metres that the vehicle keeps from others
+LANE_CHANGE_TIME = 4.0  # duration of a lane change, seconds
+FAIR_CLOUDS = 0.35  # largest share of the sky on a fair day
+MIN_GAP = 6.0  # meters between our vehicle and others
 
 
 @dataclass(frozen=True)
-class LaneChange:
+class LaneChangeManeuver:
     """A smooth move to another lane."""
 
     start: float  # seconds
-    shift: float  # metres to the left
+    shift: float  # meters to the left
 
-    def moved(self, time: float) -> float:
-        """Metres to the left at `time` seconds: no sideways speed or acceleration at either end."""
-        share = min(1.0, max(0.0, (time - self.start) / CHANGE_TIME))
+    def shift_at(self, time: float) -> float:
+        """Returns the shift to the left at `time` seconds, meters; it starts and ends at zero lateral speed."""
+        share = min(1.0, max(0.0, (time - self.start) / LANE_CHANGE_TIME))
         return self.shift * share**3 * (10.0 + share * (6.0 * share - 15.0))
 
 
 @dataclass(frozen=True)
-class Motion:
-    """How the vehicle moves along the road."""
+class VehicleMotion:
+    """The motion of our vehicle along the road."""
 
-    speed: float  # metres a second
-    sway: float  # metres to either side of its line
+    speed: float  # meters per second
+    sway: float  # amplitude of the lateral sway, meters
     sway_period: float  # seconds
-    bounce: float  # pitch to either side, radians
-    change: LaneChange | None = None
+    bounce: float  # amplitude of the pitch, radians
+    change: LaneChangeManeuver | None = None
 
     def lateral(self, time: float) -> float:
-        """Metres to the left of the starting position at `time` seconds."""
+        """Returns the distance to the left of the starting position at `time` seconds, meters."""
         sway = self.sway * math.sin(math.tau * time / self.sway_period)
-        return sway + (self.change.moved(time) if self.change else 0.0)
+        return sway + (self.change.shift_at(time) if self.change else 0.0)
 
     def heading(self, time: float) -> float:
-        """Direction of travel against the road's, radians to the left."""
+        """Returns the direction of travel relative to the road, radians to the left."""
         step = 0.01
         return math.atan2(self.lateral(time + step) - self.lateral(time - step), 2.0 * step * self.speed)
 
     def pitch(self, time: float) -> float:
-        """Pitch in radians: two springs of a car's suspension."""
+        """Returns the pitch in radians, the sum of two oscillations of a car's suspension."""
         return self.bounce * (0.65 * math.sin(math.tau * 1.3 * time) + 0.35 * math.sin(math.tau * 2.9 * time + 1.0))
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A drive: the scene at time 0, the motion, and how many pictures are taken of it."""
+    """A drive: the scene at time 0, the motion, and the number and rate of the frames."""
 
     scene: Scene
-    motion: Motion
+    motion: VehicleMotion
     frames: int
     fps: float
 
     def scene_at(self, frame: int) -> Scene:
-        """The scene at one frame. Road, paint and shadows stay; vehicles and the camera move."""
+        """Returns the scene at one frame: road, paint and shadows stay, vehicles and the camera move."""
         time, start = frame / self.fps, self.scene
         camera = replace(start.camera, horizon=start.camera.horizon + start.camera.focal * self.motion.pitch(time))
         pose = Pose(
@@ -96,63 +105,125 @@ class Clip:
 
 @dataclass(frozen=True)
 class Drive:
-    """What kind of clip to sample."""
+    """The kind of clip to sample."""
 
-    style: Style = "highway"
-    lane_change: bool = False  # where the road has a second lane in our direction
-    fair: bool = False  # a clear day and a good camera, as for a demonstration
+    style: RoadStyle = "highway"
+    lane_change: bool = False  # if the road has a second lane in our direction
+    fair: bool = False  # a clear day and a good camera
 
 
 def sample_clip(
     rng: np.random.Generator, width: int, height: int, frames: int, fps: float, drive: Drive | None = None
 ) -> Clip:
-    """A random clip of `frames` pictures of the given size in pixels; without a `drive`, of any kind."""
-    dice = RandomSampler(rng)
-    drive = drive or Drive(dice.weighed(STYLES), lane_change=dice.chance(0.3))
-    weather = Weather(night=False, dull=False, wet=False, fog=math.inf) if drive.fair else sample_weather(dice)
-    motion = Motion(
-        speed=dice.between(*SPEEDS[drive.style]),
-        sway=dice.between(0.05, 0.25),
-        sway_period=dice.between(5.0, 12.0),
-        bounce=dice.between(0.0005, 0.003),
+    """Samples a clip of `frames` images of the given size in pixels; without a `drive`, of any kind."""
+    sampler = RandomSampler(rng)
+    drive = drive or Drive(sampler.weighted_choice(STYLES), lane_change=sampler.bernoulli(0.3))
+    weather = Weather(night=False, overcast=False, wet=False, fog=math.inf) if drive.fair else sample_weather(sampler)
+    motion = VehicleMotion(
+        speed=sampler.uniform(*SPEEDS[drive.style]),
+        sway=sampler.uniform(0.05, 0.25),
+        sway_period=sampler.uniform(5.0, 12.0),
+        bounce=sampler.uniform(0.0005, 0.003),
     )
     duration = frames / fps
-    scene = compose_scene(dice, (width, height), drive.style, weather, motion.speed * duration + REACH)
+    scene = compose_scene(sampler, (width, height), drive.style, weather, motion.speed * duration + REACH)
     if drive.fair:
-        clean = Lens(saturation=1.05, noise=1.2, seed=dice.seed())
+        clean = Lens(saturation=1.05, noise=1.2, seed=sampler.seed())
         backdrop = replace(scene.backdrop, clouds=min(FAIR_CLOUDS, scene.backdrop.clouds))
-        scene = replace(scene, lens=clean, air=Air(scene.air.color, 2500.0), backdrop=backdrop)
-    # A file of its own would only repeat what the video's encoder does to the picture.
+        scene = replace(scene, lens=clean, atmosphere=Atmosphere(scene.atmosphere.color, 2500.0), backdrop=backdrop)
+    # The video encoder already compresses the frames.
     scene = replace(scene, lens=replace(scene.lens, quality=0))
     if drive.lane_change:
-        motion = replace(motion, change=_lane_change(dice, scene, duration))
+        motion = replace(motion, change=_lane_change(sampler, scene, duration))
     clip = Clip(scene, motion, frames, fps)
-    return replace(clip, scene=replace(scene, traffic=_out_of_the_way(clip)))
+    return replace(clip, scene=replace(scene, traffic=_without_collisions(clip)))
 
 
-def _lane_change(dice: RandomSampler, scene: Scene, duration: float) -> LaneChange | None:
-    """A change to a neighbouring lane of our direction, in the middle of the clip."""
+def _lane_change(sampler: RandomSampler, scene: Scene, duration: float) -> LaneChangeManeuver | None:
+    """Samples a change to an adjacent lane in our direction, mid-clip; None if there is no such lane."""
     shifts = [lane for lane in scene.road.lanes if 1.0 < abs(lane - scene.pose.u) < 4.5]
     if not shifts:
         return None
-    return LaneChange(max(0.0, (duration - CHANGE_TIME) * dice.between(0.35, 0.65)), dice.pick(shifts) - scene.pose.u)
+    return LaneChangeManeuver(
+        max(0.0, (duration - LANE_CHANGE_TIME) * sampler.uniform(0.35, 0.65)), sampler.choice(shifts) - scene.pose.u
+    )
 
 
-def _out_of_the_way(clip: Clip) -> tuple[Vehicle, ...]:
-    """The traffic without those vehicles that ours would run into."""
+def _without_collisions(clip: Clip) -> tuple[Vehicle, ...]:
+    """Returns the traffic without the vehicles that ours would collide with."""
     times = np.arange(0.0, clip.frames / clip.fps + 0.2, 0.2)
     lateral = clip.scene.pose.u + np.array([clip.motion.lateral(float(time)) for time in times])
     along = clip.scene.pose.s + clip.motion.speed * times
-    kept = []
+    remaining = []
     for vehicle in clip.scene.traffic:
         gap = vehicle.s + vehicle.speed * times - along
-        beside = np.abs(vehicle.u - lateral) < 2.4
-        if not np.any(beside & (gap < CLEAR_AHEAD) & (gap > -vehicle.length - CLEAR_AHEAD)):
-            kept.append(vehicle)
-    return tuple(kept)
+        same_lane = np.abs(vehicle.u - lateral) < 2.4
+        if not np.any(same_lane & (gap < MIN_GAP) & (gap > -vehicle.length - MIN_GAP)):
+            remaining.append(vehicle)
+    return tuple(remaining)
 
 
 def render_clip(clip: Clip) -> Iterator[RenderedFrame]:
-    """Renders the clip's frames in order, each with its timestamp."""
+    """Yields the rendered frames of the clip in order, each with its timestamp."""
     for frame in range(clip.frames):
         yield replace(render_still(clip.scene_at(frame)), timestamp=frame / clip.fps)
+
+
+def write_clip(clip: Clip, video: Path, labels: Path, progress: ProgressCallback | None = None) -> None:
+    """Renders `clip` into an MP4 file at `video` and writes the labels of every frame to `labels`.
+
+    Raises ValueError if the width or height is odd, because 4:2:0 video halves both for color.
+    """
+    camera = clip.scene.camera
+    if camera.width % 2 or camera.height % 2:
+        raise ValueError(f"a video needs an even width and height, got {camera.width}x{camera.height}")
+    with av.open(str(video), "w", format="mp4") as container, labels.open("w", encoding="utf-8") as lines:
+        stream = _add_stream(container, clip)
+        for number, frame in enumerate(render_clip(clip)):
+            video_frame = av.VideoFrame.from_ndarray(frame.image, format="bgr24")
+            video_frame.pts = number
+            video_frame.time_base = Fraction(1) / _rate(clip.fps)
+            container.mux(stream.encode(video_frame))
+            lines.write(json.dumps(label_record(frame.labels, video.name, number)) + "\n")
+            if progress:
+                progress(number + 1, clip.frames)
+        container.mux(stream.encode(None))
+
+
+def label_record(labels: LabelledFrame, clip: str, frame: int) -> dict[str, Any]:
+    """Returns the labels of one frame as a record of the clip's label file."""
+    return {
+        "clip": clip,
+        "frame": frame,
+        "width": labels.width,
+        "height": labels.height,
+        "lanes": [
+            {
+                "id": lane.lane_id,
+                "position": lane.position,
+                "type": lane.kind,
+                "color": lane.color,
+                "points": lane.points.round(1).tolist(),
+            }
+            for lane in labels.lanes
+        ],
+    }
+
+
+def _add_stream(container: av.container.OutputContainer, clip: Clip) -> VideoStream:
+    encoder = next(name for name in ENCODERS if name in av.codecs_available)
+    stream = container.add_stream(encoder, rate=_rate(clip.fps))
+    if not isinstance(stream, VideoStream):
+        raise TypeError(f"{encoder} created a {type(stream).__name__} instead of a video stream")
+    stream.width, stream.height = clip.scene.camera.width, clip.scene.camera.height
+    stream.pix_fmt = "yuv420p"
+    if encoder == "libx264":
+        stream.options = {"crf": "18", "preset": "veryfast"}
+    else:
+        stream.bit_rate = round(0.2 * stream.width * stream.height * clip.fps)
+    return stream
+
+
+def _rate(fps: float) -> Fraction:
+    """Returns the frame rate as a fraction that every container supports."""
+    return Fraction(fps).limit_denominator(1001)

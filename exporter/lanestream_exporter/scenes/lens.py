@@ -1,4 +1,4 @@
-"""The way from the scene to the file: bonnet, reflections, glare, blur, exposure, noise, compression."""
+"""The camera pipeline from scene to file: hood, reflections, glare, blur, exposure, noise, compression."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from lanestream_exporter.scenes.noise import TILE, noise_tiles
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from lanestream_exporter.scenes.render_target import Image
-    from lanestream_exporter.scenes.surface import Colour
-    from lanestream_exporter.scenes.view import Layer
+    from lanestream.road.view import Image
+    from lanestream_exporter.scenes.projection import Float32Array
+    from lanestream_exporter.scenes.surface import Color
 
 
 @dataclass(frozen=True)
-class Bonnet:
-    """The vehicle's own bonnet or dashboard along the bottom of the picture."""
+class Hood:
+    """The vehicle's own hood or dashboard along the bottom of the image."""
 
-    height: float  # at the middle, as a share of the picture's height
-    droop: float  # how much lower it is at the sides, likewise
-    color: Colour
-    shine: float  # share of the scene it mirrors
+    height: float  # at the center, as a share of the image height
+    droop: float  # drop at the sides, as a share of the image height
+    color: Color
+    shine: float  # share of the scene that it reflects
 
-    def top(self, width: int, height: int) -> Layer:
-        """The row of its edge at every image column, (width,)."""
+    def top(self, width: int, height: int) -> Float32Array:
+        """Returns the row of its edge at every image column, (width,)."""
         across = np.linspace(-1.0, 1.0, width, dtype=np.float32)
         return np.asarray(height * (1.0 - self.height + self.droop * across**2), dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class Glare:
-    """A bright haze around the sun or a lamp; place as shares of the picture's width and height."""
+    """A bright haze around the sun or a lamp; x and y as shares of the image width and height."""
 
     x: float
     y: float
@@ -45,30 +45,30 @@ class Glare:
 
 @dataclass(frozen=True)
 class Lens:
-    """What camera and windscreen do to the picture."""
+    """The effects of camera and windshield on the image."""
 
     exposure: float = 1.0
     gamma: float = 1.0
-    cast: Colour = (1.0, 1.0, 1.0)
+    cast: Color = (1.0, 1.0, 1.0)
     saturation: float = 1.0
     lift: float = 0.0  # brightness of black
     vignette: float = 0.0  # share of light lost in the corners
-    defocus: float = 0.0  # one deviation, pixels of a picture 640 wide
-    shake: float = 0.0  # length of the motion blur, likewise
+    defocus: float = 0.0  # sigma, pixels of a 640 pixel wide image
+    shake: float = 0.0  # length of the motion blur, pixels of a 640 pixel wide image
     shake_angle: float = 90.0  # degrees; 90 is up and down
-    noise: float = 0.0  # one deviation, grey levels
-    quality: int = 0  # of a JPEG file the picture goes through, 0 for none
-    reflection: float = 0.0  # strength of what the windscreen mirrors
+    noise: float = 0.0  # sigma, gray levels
+    quality: int = 0  # of the JPEG compression; 0 for no compression
+    reflection: float = 0.0  # strength of the reflections in the windshield
     glare: Glare | None = None
-    bonnet: Bonnet | None = None
+    hood: Hood | None = None
     seed: int = 0
-    frame: int = 0  # of a clip: each has its own sensor noise
+    frame: int = 0  # index in a clip; each frame has its own sensor noise
 
 
 def develop(image: Image, lens: Lens) -> Image:
-    """The picture as the camera's file shows it, (H, W, 3) uint8. The bonnet is drawn into `image` itself."""
-    if lens.bonnet:
-        _draw_bonnet(image, lens.bonnet)
+    """Returns the image as recorded by the camera, (H, W, 3) uint8. The hood is drawn into `image` itself."""
+    if lens.hood:
+        _draw_hood(image, lens.hood)
     if lens.saturation != 1.0:
         image = _saturate(image, lens.saturation)
     image = _blur(image, lens)
@@ -83,27 +83,27 @@ def develop(image: Image, lens: Lens) -> Image:
     return _compressed(image, lens.quality) if lens.quality else image
 
 
-def _draw_bonnet(image: Image, bonnet: Bonnet) -> None:
+def _draw_hood(image: Image, hood: Hood) -> None:
     height, width = image.shape[:2]
-    edge = bonnet.top(width, height)
+    edge = hood.top(width, height)
     first = int(max(0.0, edge.min() - 1.0))
     region = image[first:].astype(np.float32)
     rows = np.arange(first, height, dtype=np.float32)[:, None]
     depth = np.clip(rows - edge + 0.5, 0.0, None)
     cover = np.minimum(depth, 1.0)[..., None]
     mirrored = cv2.blur(image[max(0, 2 * first - height) : first][::-1], (max(3, width // 40), 3)).astype(np.float32)
-    body = np.array(bonnet.color, np.float32) * np.float32(255.0)
+    body = np.array(hood.color, np.float32) * np.float32(255.0)
     falling = np.exp(-depth / (0.05 * height))[..., None] * np.float32(0.35) + np.float32(0.8)
     mirrored = mirrored[: len(region)]
     painted = np.broadcast_to(body * falling, region.shape).copy()
-    painted[: len(mirrored)] += bonnet.shine * mirrored
+    painted[: len(mirrored)] += hood.shine * mirrored
     region += cover * (painted - region)
     image[first:] = np.clip(region, 0.0, 255.0).astype(np.uint8)
 
 
 def _saturate(image: Image, saturation: float) -> Image:
-    grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-    return np.asarray(cv2.addWeighted(image, saturation, grey, 1.0 - saturation, 0.0), dtype=np.uint8)
+    gray = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    return np.asarray(cv2.addWeighted(image, saturation, gray, 1.0 - saturation, 0.0), dtype=np.uint8)
 
 
 def _blur(image: Image, lens: Lens) -> Image:
@@ -116,16 +116,16 @@ def _blur(image: Image, lens: Lens) -> Image:
         kernel = np.zeros((size, size), np.float32)
         angle = np.radians(lens.shake_angle)
         tip = np.array([np.cos(angle), np.sin(angle)]) * length / 2.0
-        middle = (size - 1) / 2.0
-        ends = np.round((middle + np.stack([-tip, tip])) * 16).astype(int)
+        center = (size - 1) / 2.0
+        ends = np.round((center + np.stack([-tip, tip])) * 16).astype(int)
         cv2.line(kernel, ends[0].tolist(), ends[1].tolist(), (1.0,), 1, cv2.LINE_8, 4)
-        kernel += kernel[::-1, ::-1]  # the same to both sides, so that nothing moves
+        kernel += kernel[::-1, ::-1]  # symmetric, so that the image does not shift
         image = np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()), dtype=np.uint8)
     return image
 
 
 def _veil(width: int, height: int, lens: Lens) -> Image | None:
-    """Light added by glare and by the windscreen, drawn small because it is smooth."""
+    """Returns the light added by glare and reflections; smooth, so computed at an eighth of the resolution."""
     if lens.glare is None and lens.reflection <= 0.0:
         return None
     columns, rows = max(2, width // 8), max(2, height // 8)
@@ -155,7 +155,7 @@ def _vignetted(image: Image, strength: float) -> Image:
 
 
 def _tone_curve(lens: Lens) -> NDArray[np.uint8]:
-    """Look-up table (1, 256, 3) for exposure, colour cast, gamma and black level."""
+    """Returns a lookup table (1, 256, 3) for exposure, color cast, gamma and black level."""
     level = np.arange(256)[:, None] / 255.0 * lens.exposure * np.array(lens.cast)
     # A soft shoulder instead of a hard clip: bright paint on bright concrete keeps a little contrast.
     knee = 0.8
@@ -165,7 +165,7 @@ def _tone_curve(lens: Lens) -> NDArray[np.uint8]:
 
 
 def _noisy(image: Image, lens: Lens) -> Image:
-    """Sensor noise, mostly in brightness, drawn for a tile and repeated with an offset per colour."""
+    """Adds sensor noise: one random tile, repeated with a different offset for each channel."""
     rng = np.random.default_rng((lens.seed, lens.frame))
     height, width = image.shape[:2]
     grain = rng.standard_normal((256, 256), dtype=np.float32) * np.float32(lens.noise)

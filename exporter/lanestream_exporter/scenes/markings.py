@@ -1,4 +1,4 @@
-"""Paint and dots on the lane boundaries, and marks on the road that are no boundary."""
+"""Paint and dots on the lane boundaries, and marks on the road that aren't lane boundaries."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from lanestream_exporter.scenes.noise import noise_tiles, sample
-from lanestream_exporter.scenes.view import Band, Grid, Layer, coverage, pulse
+from lanestream_exporter.scenes.noise import noise_tiles, sample_noise
+from lanestream_exporter.scenes.projection import Float32Array, GroundBand, GroundGrid, coverage, pulse
 
 if TYPE_CHECKING:
     from lanestream_exporter.scenes.road import Marking, Road
-    from lanestream_exporter.scenes.surface import Colour
+    from lanestream_exporter.scenes.surface import Color
 
-DOT_RISE = 0.02  # metres a dot stands out of the road
-STENCIL_SCALE = 50.0  # pixels of a stencil's mask a metre
+DOT_RISE = 0.02  # height of a dot above the road, meters
+STENCIL_SCALE = 50.0  # resolution of a stencil's mask, pixels per meter
 
 
 @dataclass(frozen=True)
-class Ghost:
-    """What is left of an older marking: grey, thin, off the present boundary. Not a lane boundary."""
+class GhostMarking:
+    """The remains of an old marking: gray, thin, away from the current boundaries. Not a lane boundary."""
 
     u: float
     marking: Marking
-    sway: float  # metres it swings to either side
-    swing: float  # metres of road that one swing takes
+    sway: float  # amplitude of its lateral swing, meters
+    swing: float  # wavelength of the swing, meters
     tone: float  # brightness, 0 to 1
 
 
 @dataclass(frozen=True)
 class Stencil:
-    """A mark inside a lane: a word or an arrow, drawn out along the road so that drivers can read it."""
+    """A word or an arrow inside a lane, stretched along the road so that drivers can read it."""
 
     text: str  # a word in capitals, or one of "^", "<", ">" for an arrow ahead, left, right
-    s: float  # of its lower end, metres
-    u: float  # of its middle
+    s: float  # of its near end, meters
+    u: float  # of its center
     length: float
     width: float
     brightness: float
@@ -47,13 +47,13 @@ class Stencil:
 
 @dataclass(frozen=True)
 class Bars:
-    """Bars across the road: a stop line, or the bars of a crossing. Metres."""
+    """Bars across the road: a stop line, or the bars of a crosswalk. Meters."""
 
     s: float
     length: float  # along the road
     low: float
     high: float
-    period: float  # across the road; 0 for one unbroken bar
+    period: float  # across the road; 0 for a single unbroken bar
     bar: float  # width of each bar across the road
     brightness: float
     wear: float
@@ -62,47 +62,47 @@ class Bars:
 
 @dataclass(frozen=True)
 class Paintwork:
-    """Everything painted on the road that is no lane boundary."""
+    """All paint on the road that isn't a lane boundary."""
 
-    ghosts: tuple[Ghost, ...] = ()
+    ghosts: tuple[GhostMarking, ...] = ()
     stencils: tuple[Stencil, ...] = ()
     bars: tuple[Bars, ...] = ()
 
 
-def paint_colour(marking: Marking) -> Colour:
-    """Blue, green, red of a marking in full daylight."""
+def paint_color(marking: Marking) -> Color:
+    """Returns blue, green, red of a marking in full daylight."""
     shade = marking.brightness
     if marking.color == "white":
         return (0.97 * shade, shade, 0.99 * shade)
     return (0.28 * shade, 0.78 * shade, shade)
 
 
-def paint_boundaries(grid: Grid, road: Road, ground: Layer) -> None:
-    """Paints every marked boundary into the unlit ground."""
+def paint_boundaries(grid: GroundGrid, road: Road, ground: Float32Array) -> None:
+    """Paints every marked boundary onto the unlit ground, in place."""
     for boundary in road.boundaries:
         if boundary.marking:
             band = _around(grid, boundary.u, boundary.marking)
-            _blend(ground, band, marking_cover(band, boundary.u, boundary.marking), paint_colour(boundary.marking))
+            _blend(ground, band, marking_coverage(band, boundary.u, boundary.marking), paint_color(boundary.marking))
 
 
-def paint_others(grid: Grid, paintwork: Paintwork, ground: Layer) -> None:
-    """Paints ghosts, stencils and bars into the unlit ground."""
-    view = grid.view
+def paint_other_marks(grid: GroundGrid, paintwork: Paintwork, ground: Float32Array) -> None:
+    """Paints ghost markings, stencils and bars onto the unlit ground, in place."""
+    projection = grid.projection
     for ghost in paintwork.ghosts:
         band = grid.band(ghost.u - ghost.sway - 0.3, ghost.u + ghost.sway + 0.3)
-        swung = np.float32(ghost.sway) * np.sin(band.s * np.float32(math.tau / ghost.swing))
-        cover = marking_cover(replace(band, u=band.u - swung), ghost.u, ghost.marking)
+        offset = np.float32(ghost.sway) * np.sin(band.s * np.float32(math.tau / ghost.swing))
+        cover = marking_coverage(replace(band, u=band.u - offset), ghost.u, ghost.marking)
         _blend(ground, band, cover, (ghost.tone, ghost.tone, ghost.tone))
     for stencil in paintwork.stencils:
-        if view.spans(stencil.s, stencil.s + stencil.length):
+        if projection.overlaps(stencil.s, stencil.s + stencil.length):
             _paint_stencil(grid, stencil, ground)
     for bars in paintwork.bars:
-        if view.spans(bars.s, bars.s + bars.length):
+        if projection.overlaps(bars.s, bars.s + bars.length):
             _paint_bars(grid, bars, ground)
 
 
-def marking_cover(band: Band, u: float, marking: Marking) -> Layer:
-    """Share of each pixel of the band that paint covers, (N,)."""
+def marking_coverage(band: GroundBand, u: float, marking: Marking) -> Float32Array:
+    """Returns the share of each pixel of the band that is covered by paint, (N,)."""
     offset = band.u - np.float32(u)
     s = band.s - np.float32(marking.phase)
     if marking.kind == "botts":
@@ -119,17 +119,17 @@ def marking_cover(band: Band, u: float, marking: Marking) -> Layer:
         cover = coverage(offset, marking.width, band.across)
         if marking.kind == "dashed":
             cover *= pulse(s, marking.period, marking.dash, band.along)
-    return cover * _left_over(band, marking.wear, marking.seed)
+    return cover * _paint_left(band, marking.wear, marking.seed)
 
 
-def _around(grid: Grid, u: float, marking: Marking) -> Band:
-    """The pixels a marking may touch: its stripes, and what a far pixel covers."""
+def _around(grid: GroundGrid, u: float, marking: Marking) -> GroundBand:
+    """Returns the pixels that a marking may touch: its stripes plus a margin for the footprint of far pixels."""
     reach = 1.5 * marking.width + marking.gap + 0.1
     return grid.band(u - reach, u + reach)
 
 
-def _dots(band: Band, offset: Layer, s: Layer, marking: Marking) -> Layer:
-    """Groups of raised dots. Seen flatly they show their side, which lengthens them on the ground."""
+def _dots(band: GroundBand, offset: Float32Array, s: Float32Array, marking: Marking) -> Float32Array:
+    """Returns the coverage by groups of raised dots; at a grazing angle their sides lengthen them on the ground."""
     spacing = marking.dash / (marking.dots - 1) if marking.dots > 1 else marking.period
     rise = np.float32(DOT_RISE * 0.7) * band.distance
     length = np.float32(marking.width) + np.minimum(rise, np.float32(0.4 * spacing))
@@ -137,7 +137,7 @@ def _dots(band: Band, offset: Layer, s: Layer, marking: Marking) -> Layer:
     nearest = np.clip(np.round(within / spacing), 0, marking.dots - 1) * np.float32(spacing)
     ahead = (within - nearest).astype(np.float32)
     cover = coverage(ahead, length.astype(np.float32), np.maximum(band.along, 0.01))
-    # Round from above: narrower towards its near and far end, where the picture can show it.
+    # A dot is round, so it narrows towards its near and far ends.
     chord = np.sqrt(np.clip(1.0 - np.square(ahead / length) * 3.0, 0.1, 1.0)).astype(np.float32)
     cover *= coverage(offset, np.float32(marking.width) * chord, band.across)
     keep = np.random.default_rng(marking.seed).random(64) >= marking.wear
@@ -145,13 +145,13 @@ def _dots(band: Band, offset: Layer, s: Layer, marking: Marking) -> Layer:
     return np.asarray(cover * keep[np.round(group).astype(np.int64) % 64], dtype=np.float32)
 
 
-def _left_over(band: Band, wear: float, seed: int) -> Layer:
-    """Share of paint left, (N,): chipped where noise at two scales falls below the wear."""
+def _paint_left(band: GroundBand, wear: float, seed: int) -> Float32Array:
+    """Returns the share of paint left, (N,): chipped where noise at two scales falls below the wear."""
     if wear <= 0.0:
         return np.ones_like(band.u)
     tiles = noise_tiles()
-    noise = sample(tiles.cloud, band.u, band.s, (0.012, 0.05), seed)
-    noise += 0.6 * sample(tiles.fine, band.u, band.s, (0.012, 0.02), seed + 1)
+    noise = sample_noise(tiles.cloud, band.u, band.s, (0.012, 0.05), seed)
+    noise += 0.6 * sample_noise(tiles.fine, band.u, band.s, (0.012, 0.02), seed + 1)
     # A far pixel averages over many chips, so its noise shrinks towards the mean.
     fade = np.minimum(1.0, 0.15 / np.maximum(np.maximum(band.across, band.along), 1e-3)).astype(np.float32)
     threshold = np.float32(-2.2 + 3.6 * wear)
@@ -159,16 +159,16 @@ def _left_over(band: Band, wear: float, seed: int) -> Layer:
     return np.asarray(soft * np.float32(1.0 - 0.35 * wear), dtype=np.float32)
 
 
-def _blend(ground: Layer, band: Band, cover: Layer, color: Colour) -> None:
+def _blend(ground: Float32Array, band: GroundBand, cover: Float32Array, color: Color) -> None:
     flat = ground.reshape(-1, 3)
     cover = np.clip(cover, 0.0, 1.0)[:, None]
-    here = flat[band.index]
-    flat[band.index] = here + cover * (np.array(color, np.float32) - here)
+    ground_color = flat[band.index]
+    flat[band.index] = ground_color + cover * (np.array(color, np.float32) - ground_color)
 
 
-def _paint_stencil(grid: Grid, stencil: Stencil, ground: Layer) -> None:
+def _paint_stencil(grid: GroundGrid, stencil: Stencil, ground: Float32Array) -> None:
     band = grid.band(stencil.u - stencil.width / 2.0, stencil.u + stencil.width / 2.0)
-    band = band.between(stencil.s, stencil.s + stencil.length)
+    band = band.within(stencil.s, stencil.s + stencil.length)
     if not band.index.size:
         return
     mask = stencil_mask(stencil.text)
@@ -177,11 +177,11 @@ def _paint_stencil(grid: Grid, stencil: Stencil, ground: Layer) -> None:
     down = (np.float32(stencil.s + stencil.length) - band.s) * np.float32(rows / stencil.length)
     cover = mask[np.clip(down, 0, rows - 1).astype(np.intp), np.clip(right, 0, columns - 1).astype(np.intp)]
     shade = stencil.brightness
-    _blend(ground, band, cover * _left_over(band, stencil.wear, stencil.seed), (shade, shade, shade))
+    _blend(ground, band, cover * _paint_left(band, stencil.wear, stencil.seed), (shade, shade, shade))
 
 
-def stencil_mask(text: str) -> Layer:
-    """The outline of a word or arrow as a mask 0 to 1, top of the mask farthest along the road."""
+def stencil_mask(text: str) -> Float32Array:
+    """Returns a word or an arrow as a mask, 0 to 1; its top row is the farthest along the road."""
     size = round(2.4 * STENCIL_SCALE)
     mask = np.zeros((size, size), np.uint8)
     if text in {"^", "<", ">"}:
@@ -196,19 +196,19 @@ def stencil_mask(text: str) -> Layer:
     else:
         scale, thickness = 3.0, 14
         (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
-        word = np.zeros((height + thickness, width + thickness), np.uint8)
+        raster = np.zeros((height + thickness, width + thickness), np.uint8)
         origin = (thickness // 2, height + thickness // 2)
-        cv2.putText(word, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness, cv2.LINE_AA)
-        cv2.resize(word, (size, size), mask, interpolation=cv2.INTER_AREA)
+        cv2.putText(raster, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness, cv2.LINE_AA)
+        cv2.resize(raster, (size, size), mask, interpolation=cv2.INTER_AREA)
     return np.asarray(mask, dtype=np.float32) / np.float32(255.0)
 
 
-def _paint_bars(grid: Grid, bars: Bars, ground: Layer) -> None:
-    # A far pixel covers metres of road, so the bars' ends show up to a metre beyond them.
-    band = grid.band(bars.low, bars.high).between(bars.s - 1.0, bars.s + bars.length + 1.0)
+def _paint_bars(grid: GroundGrid, bars: Bars, ground: Float32Array) -> None:
+    # A far pixel covers meters of road, so the ends of the bars show up to a meter beyond them.
+    band = grid.band(bars.low, bars.high).within(bars.s - 1.0, bars.s + bars.length + 1.0)
     cover = coverage(band.s - np.float32(bars.s + bars.length / 2.0), bars.length, band.along)
     if bars.period > 0.0:
         cover *= pulse(band.u - np.float32(bars.low), bars.period, bars.bar, band.across)
     cover *= (band.u > bars.low) & (band.u < bars.high)
     shade = bars.brightness
-    _blend(ground, band, cover * _left_over(band, bars.wear, bars.seed), (shade, shade, shade))
+    _blend(ground, band, cover * _paint_left(band, bars.wear, bars.seed), (shade, shade, shade))

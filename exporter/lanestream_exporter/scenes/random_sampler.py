@@ -1,4 +1,4 @@
-"""Random choices that come back as plain Python values."""
+"""Random choices that return plain Python values."""
 
 from __future__ import annotations
 
@@ -15,36 +15,36 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class RandomSampler:
-    """A random generator with the few kinds of choice that sampling a scene needs."""
+    """Wraps a random generator with the distributions that scene sampling needs."""
 
     rng: np.random.Generator
 
-    def between(self, low: float, high: float) -> float:
-        """A uniform number from low to high."""
+    def uniform(self, low: float, high: float) -> float:
+        """Returns a number drawn uniformly from [low, high)."""
         return float(self.rng.uniform(low, high))
 
-    def around(self, deviation: float, limit: float = 2.5) -> float:
-        """A normal number about zero, cut at `limit` deviations."""
-        return float(np.clip(self.rng.normal(0.0, 1.0), -limit, limit)) * deviation
+    def normal(self, sigma: float, limit: float = 2.5) -> float:
+        """Returns a zero-mean normal number, clipped at `limit` sigmas."""
+        return float(np.clip(self.rng.normal(0.0, 1.0), -limit, limit)) * sigma
 
-    def whole(self, low: int, high: int) -> int:
-        """A whole number from low to high, both included."""
+    def integer(self, low: int, high: int) -> int:
+        """Returns an integer drawn uniformly from low to high, both included."""
         return int(self.rng.integers(low, high + 1))
 
-    def chance(self, share: float) -> bool:
-        """True in this share of cases."""
-        return bool(self.rng.random() < share)
+    def bernoulli(self, probability: float) -> bool:
+        """Returns True with the given probability."""
+        return bool(self.rng.random() < probability)
 
-    def pick(self, options: Sequence[T]) -> T:
-        """One of the options, each as likely."""
+    def choice(self, options: Sequence[T]) -> T:
+        """Returns one of the options, all equally likely."""
         return options[int(self.rng.integers(len(options)))]
 
-    def weighed(self, options: Mapping[T, float]) -> T:
-        """One of the keys, as likely as its weight says."""
+    def weighted_choice(self, options: Mapping[T, float]) -> T:
+        """Returns one of the keys, with a probability proportional to its weight."""
         weights = np.array(list(options.values()))
         keys: list[T] = list(options)
         return keys[int(self.rng.choice(len(weights), p=weights / weights.sum()))]
 
     def seed(self) -> int:
-        """A seed for something drawn later."""
+        """Returns a seed for a generator that is created later."""
         return int(self.rng.integers(2**31))

@@ -1,103 +1,155 @@
-"""Drawing a scene: ground, backdrop, things from far to near, then the lens."""
+"""Rendering a scene: backdrop, ground, objects from far to near and the lens, with the exact labels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import compress
-from operator import not_
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from lanestream_exporter.scenes.annotation import annotate
+from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
 from lanestream_exporter.scenes.backdrop import draw_backdrop
 from lanestream_exporter.scenes.lens import develop
 from lanestream_exporter.scenes.light import haze_ground, light_ground
-from lanestream_exporter.scenes.markings import paint_boundaries, paint_others
-from lanestream_exporter.scenes.render_target import Canvas, Image
-from lanestream_exporter.scenes.roadside import Bridge, Item, draw_bridge, draw_item, draw_wall
+from lanestream_exporter.scenes.markings import paint_boundaries, paint_other_marks
+from lanestream_exporter.scenes.projection import GroundGrid, RoadProjection
+from lanestream_exporter.scenes.render_target import RenderTarget
+from lanestream_exporter.scenes.roadside import Bridge, RoadsideItem, draw_bridge, draw_item, draw_wall
 from lanestream_exporter.scenes.surface import paint_ground
 from lanestream_exporter.scenes.traffic import Vehicle, draw_vehicle
-from lanestream_exporter.scenes.view import Grid, RoadView
 
 if TYPE_CHECKING:
-    from lanestream_exporter.datasets.labels import LabelledFrame
+    from lanestream.road.curve import FloatArray
+    from lanestream.road.view import Image
     from lanestream_exporter.scenes.scene import Scene
 
 
-MARGIN = 30.0  # metres that the longest thing at the roadside reaches beyond its s
+SOURCE = "rendered"
+MAX_LABEL_DISTANCE = 120.0  # meters; people do not label boundaries farther away
+MIN_LANE_WIDTH = 12.0  # pixels of a 640 pixel wide image; the boundaries of narrower lanes merge
+USUAL_LANE = 3.5  # meters
+LABEL_ROWS = 90  # approximate number of rows with label points over the image height
+MIN_LABEL_SPAN = 0.05  # share of the image height that a label must span
+
+MAX_OBJECT_LENGTH = 30.0  # meters that an object extends beyond its s
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A picture and its ground truth."""
+    """A rendered image and its ground truth."""
 
     image: Image  # (H, W, 3) uint8, blue, green, red
     labels: LabelledFrame
-    horizon: float  # image row of the road's vanishing plane, pixels
-    timestamp: float = 0.0  # seconds since the clip began
+    horizon: float  # image row of the road plane's vanishing line, pixels
+    timestamp: float = 0.0  # seconds since the start of the clip
 
 
 def render_still(scene: Scene) -> RenderedFrame:
     """Renders one scene. The same scene always gives the same pixels."""
     camera = scene.camera
-    view = RoadView.ahead(camera, scene.road.course, scene.pose)
-    grid = Grid.of(view)
+    projection = RoadProjection.from_pose(camera, scene.road.course, scene.pose)
+    grid = GroundGrid.from_projection(projection)
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
-    canvas = Canvas(image, np.zeros(image.shape[:2], np.uint8), view, scene.light, scene.air)
-    draw_backdrop(canvas, scene.backdrop, grid.top)
-    _draw_ground(canvas, scene, grid)
-    _draw_things(canvas, scene)
+    target = RenderTarget(image, np.zeros(image.shape[:2], np.uint8), projection, scene.light, scene.atmosphere)
+    draw_backdrop(target, scene.backdrop, grid.top)
+    _draw_ground(target, scene, grid)
+    _draw_objects(target, scene)
     if scene.wetness > 0.0:
-        _mirror(canvas, grid, scene.wetness)
-    labels = annotate(scene, view, canvas.hidden)
-    return RenderedFrame(develop(canvas.image, scene.lens), labels, camera.horizon)
+        _reflect(target, grid, scene.wetness)
+    labels = annotate(scene, projection, target.hidden)
+    return RenderedFrame(develop(target.image, scene.lens), labels, camera.horizon)
 
 
-def _draw_ground(canvas: Canvas, scene: Scene, grid: Grid) -> None:
+def _draw_ground(target: RenderTarget, scene: Scene, grid: GroundGrid) -> None:
     if not grid.u.size:
         return
     ground = paint_ground(grid, scene.surface)
-    paint_others(grid, scene.paintwork, ground)
+    paint_other_marks(grid, scene.paintwork, ground)
     paint_boundaries(grid, scene.road, ground)
     light_ground(grid, scene.light, ground)
-    haze_ground(grid, scene.air, ground)
-    cv2.convertScaleAbs(ground, canvas.image[grid.top :], alpha=255.0)
+    haze_ground(grid, scene.atmosphere, ground)
+    cv2.convertScaleAbs(ground, target.image[grid.top :], alpha=255.0)
 
 
-def _draw_things(canvas: Canvas, scene: Scene) -> None:
-    """Far before near; and what stands behind a wall before the wall, what drives inside after it."""
+def _draw_objects(target: RenderTarget, scene: Scene) -> None:
+    """Draws objects from far to near; those behind a wall before the wall, those inside the walls after it."""
     left = min((wall.u for wall in scene.walls if wall.u > scene.pose.u), default=1e6)
     right = max((wall.u for wall in scene.walls if wall.u < scene.pose.u), default=-1e6)
-    everything: tuple[Bridge | Item | Vehicle, ...] = (*scene.bridges, *scene.items, *scene.traffic)
-    things = [thing for thing in everything if canvas.view.spans(thing.s, thing.s + MARGIN)]
-    things.sort(key=lambda thing: -thing.s)
-    inside = [not isinstance(thing, Bridge) and right < thing.u < left for thing in things]
-    for thing in compress(things, map(not_, inside)):
-        _draw_thing(canvas, thing)
+    everything: tuple[Bridge | RoadsideItem | Vehicle, ...] = (*scene.bridges, *scene.items, *scene.traffic)
+    objects = [item for item in everything if target.projection.overlaps(item.s, item.s + MAX_OBJECT_LENGTH)]
+    objects.sort(key=lambda item: -item.s)
+    inside = [item for item in objects if not isinstance(item, Bridge) and right < item.u < left]
+    outside = [item for item in objects if isinstance(item, Bridge) or not right < item.u < left]
+    for item in outside:
+        _draw_object(target, item)
     for wall in sorted(scene.walls, key=lambda wall: -abs(wall.u - scene.pose.u)):
-        draw_wall(canvas, wall)
-    for thing in compress(things, inside):
-        _draw_thing(canvas, thing)
+        draw_wall(target, wall)
+    for item in inside:
+        _draw_object(target, item)
 
 
-def _draw_thing(canvas: Canvas, thing: Bridge | Item | Vehicle) -> None:
-    if isinstance(thing, Bridge):
-        draw_bridge(canvas, thing)
-    elif isinstance(thing, Item):
-        draw_item(canvas, thing)
+def _draw_object(target: RenderTarget, item: Bridge | RoadsideItem | Vehicle) -> None:
+    if isinstance(item, Bridge):
+        draw_bridge(target, item)
+    elif isinstance(item, RoadsideItem):
+        draw_item(target, item)
     else:
-        draw_vehicle(canvas, thing)
+        draw_vehicle(target, item)
 
 
-def _mirror(canvas: Canvas, grid: Grid, wetness: float) -> None:
-    """Adds the upside-down, smeared picture of what stands above the road to the wet ground."""
-    height = canvas.image.shape[0] - grid.top
-    above = canvas.image[max(0, grid.top - height) : grid.top][::-1]
+def _reflect(target: RenderTarget, grid: GroundGrid, wetness: float) -> None:
+    """Adds the mirrored, blurred image of everything above the horizon to the wet ground."""
+    height = target.image.shape[0] - grid.top
+    above = target.image[max(0, grid.top - height) : grid.top][::-1]
     if len(above) < 2:
         return
     smeared = cv2.blur(above, (3, max(3, height // 12)))
-    target = canvas.image[grid.top : grid.top + len(smeared)]
+    region = target.image[grid.top : grid.top + len(smeared)]
     fade = np.linspace(1.0, 0.3, len(smeared), dtype=np.float32)[:, None, None] * np.float32(wetness)
-    target[...] = np.clip(target * (1.0 - 0.5 * fade) + smeared * fade, 0.0, 255.0).astype(np.uint8)
+    region[...] = np.clip(region * (1.0 - 0.5 * fade) + smeared * fade, 0.0, 255.0).astype(np.uint8)
+
+
+def annotate(scene: Scene, projection: RoadProjection, hidden: Image) -> LabelledFrame:
+    """Returns the labels of a frame. `hidden` (H, W) is non-zero where walls, trees or houses hide the road."""
+    camera = scene.camera
+    rows = _rows(scene, projection)
+    lanes = []
+    for lane_id, position in enumerate(scene.road.positions(scene.pose.u)):
+        boundary = scene.road.boundaries[lane_id]
+        points = _visible(scene, hidden, np.stack([projection.boundary_columns(rows, boundary.u), rows], axis=-1))
+        if len(points) < 3 or points[0, 1] - points[-1, 1] < MIN_LABEL_SPAN * camera.height:
+            continue
+        color = boundary.marking.color if boundary.marking else None
+        lanes.append(LabelledLane(points, lane_id, position, boundary.kind, color))
+    return LabelledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, WHOLE)
+
+
+def _rows(scene: Scene, projection: RoadProjection) -> FloatArray:
+    """Returns the image rows with label points, from the bottom up."""
+    camera = scene.camera
+    step = max(1, camera.height // LABEL_ROWS)
+    rows = np.arange(camera.height - 1, -1, -step, dtype=np.float64)
+    distance = camera.road_distance(rows, projection.vertical_curvature)
+    max_distance = camera.focal * USUAL_LANE / (MIN_LANE_WIDTH * camera.width / 640.0)
+    return rows[distance < min(MAX_LABEL_DISTANCE, max_distance, projection.reach, visibility(scene))]
+
+
+def visibility(scene: Scene) -> float:
+    """Returns the distance at which paint is still visible through haze and darkness, meters."""
+    haze = 2.5 * scene.atmosphere.range
+    return min(haze, 2.5 * scene.light.headlights) if scene.light.headlights > 0.0 else haze
+
+
+def _visible(scene: Scene, hidden: Image, points: FloatArray) -> FloatArray:
+    """Returns the points inside the image and above the hood, without a far end hidden by a solid object."""
+    width, height = scene.camera.width, scene.camera.height
+    points = points[(points[:, 0] >= 0.0) & (points[:, 0] <= width - 1)]
+    if not len(points):
+        return points
+    columns, rows = np.round(points).astype(int).T
+    if scene.lens.hood:
+        above = rows < scene.lens.hood.top(width, height)[columns] - 1.0
+        points, columns, rows = points[above], columns[above], rows[above]
+    visible = np.flatnonzero(hidden[rows, columns] == 0)
+    return points[: visible[-1] + 1] if len(visible) else points[:0]

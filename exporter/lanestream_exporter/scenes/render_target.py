@@ -1,4 +1,4 @@
-"""The picture under way, and drawing lit, hazy shapes into it."""
+"""The image that is being rendered, and drawing of lit, hazy shapes into it."""
 
 from __future__ import annotations
 
@@ -12,66 +12,65 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lanestream_exporter.scenes.camera import FloatArray
-    from lanestream_exporter.scenes.light import Air, Light
-    from lanestream_exporter.scenes.surface import Colour
-    from lanestream_exporter.scenes.view import RoadView
-
-Image = NDArray[np.uint8]
+    from lanestream.road.curve import FloatArray
+    from lanestream.road.view import Image
+    from lanestream_exporter.scenes.light import Atmosphere, SceneLight
+    from lanestream_exporter.scenes.projection import RoadProjection
+    from lanestream_exporter.scenes.surface import Color
 
 SUBPIXEL_BITS = 4
-FARTHEST_PIXEL = 20_000.0  # polygons are clamped to this, far outside any picture, to stay within OpenCV's range
+FARTHEST_PIXEL = 20_000.0  # polygons are clamped to this, far outside any image, to stay within OpenCV's range
 
 
 @dataclass(frozen=True)
-class Canvas:
-    """The picture (H, W, 3) uint8 and the mask (H, W) of what hides the road for good: walls, trees, houses."""
+class RenderTarget:
+    """The image (H, W, 3) uint8, and the mask (H, W) of static objects that hide the road: walls, trees, houses."""
 
     image: Image
     hidden: Image
-    view: RoadView
-    light: Light
-    air: Air
+    projection: RoadProjection
+    light: SceneLight
+    atmosphere: Atmosphere
 
-    def tone(self, color: Colour, x: float, y: float) -> tuple[float, float, float]:
-        """Displayed colour, 0 to 255, of a thing at vehicle-frame (x, y)."""
+    def tone(self, color: Color, x: float, y: float) -> tuple[float, float, float]:
+        """Returns the displayed color, 0 to 255, of an object at vehicle-frame (x, y)."""
         level = self.light.level(x, y)
-        clear = self.air.clearness(x)
+        transmitted = self.atmosphere.transmittance(x)
         blue, green, red = (
-            255.0 * min(1.0, part * level * clear + mist * (1.0 - clear))
-            for part, mist in zip(color, self.air.color, strict=True)
+            255.0 * min(1.0, part * level * transmitted + haze * (1.0 - transmitted))
+            for part, haze in zip(color, self.atmosphere.color, strict=True)
         )
         return blue, green, red
 
     def polygon(self, points: FloatArray, tone: tuple[float, float, float], *, hides: bool = False) -> None:
-        """Fills a polygon (N, 2) of image pixels; `hides` also marks the road behind it as hidden."""
+        """Fills a polygon (N, 2) in image pixels; with `hides` the road behind it is also marked as hidden."""
         fixed = fixed_point(points)
         cv2.fillPoly(self.image, [fixed], tone, cv2.LINE_AA, SUBPIXEL_BITS)
         if hides:
             cv2.fillPoly(self.hidden, [fixed], (255.0,), cv2.LINE_8, SUBPIXEL_BITS)
 
-    def blend(self, patch: NDArray[np.float32], alpha: NDArray[np.float32], left: int, top: int) -> None:
-        """Blends a patch (h, w, 3), 0 to 255, over the picture at (left, top), cut at the picture's border."""
+    def blend(self, source: NDArray[np.float32], alpha: NDArray[np.float32], left: int, top: int) -> None:
+        """Blends `source` (h, w, 3), 0 to 255, over the image at (left, top), clipped at the image border."""
         rows, columns = (
-            overlap(top, patch.shape[0], self.image.shape[0]),
-            overlap(left, patch.shape[1], self.image.shape[1]),
+            overlap(top, source.shape[0], self.image.shape[0]),
+            overlap(left, source.shape[1], self.image.shape[1]),
         )
         inside = (slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left))
         region = self.image[rows, columns]
         if region.size:
-            mixed = region + alpha[inside][..., None] * (patch[inside] - region)
+            mixed = region + alpha[inside][..., None] * (source[inside] - region)
             region[...] = mixed.astype(np.uint8)
 
     def glow(self, point: FloatArray, radius: float, strength: float) -> None:
-        """Adds a soft white light around an image point; it fades out within `radius` pixels."""
+        """Adds a soft white light around an image point that fades out within `radius` pixels."""
         size = round(radius)
         left, top = round(float(point[0])) - size, round(float(point[1])) - size
-        away = np.hypot(*np.ogrid[-size : size + 1, -size : size + 1]) / max(radius, 1.0)
-        alpha = (strength * np.square(np.clip(1.0 - away, 0.0, 1.0))).astype(np.float32)
+        distance = np.hypot(*np.ogrid[-size : size + 1, -size : size + 1]) / max(radius, 1.0)
+        alpha = (strength * np.square(np.clip(1.0 - distance, 0.0, 1.0))).astype(np.float32)
         self.blend(np.full((*alpha.shape, 3), 255.0, np.float32), alpha, left, top)
 
     def darken(self, points: FloatArray, depth: float, softness: float) -> None:
-        """Takes the share `depth` of light from a polygon, with edges blurred over `softness` pixels."""
+        """Darkens a polygon by the share `depth`, with edges blurred over `softness` pixels."""
         margin = 2.0 * softness + 2.0
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
         height, width = self.image.shape[:2]
@@ -88,12 +87,12 @@ class Canvas:
 
 
 def overlap(start: int, length: int, limit: int) -> slice:
-    """The part of [start, start + length) that lies in [0, limit)."""
+    """Returns the part of [start, start + length) that lies in [0, limit)."""
     first = min(max(start, 0), limit)
     return slice(first, max(first, min(start + length, limit)))
 
 
 def fixed_point(points: FloatArray | Sequence[Sequence[float]]) -> NDArray[np.int32]:
-    """Points in the fixed-point form of OpenCV's drawing calls with SUBPIXEL_BITS."""
+    """Returns points in the fixed-point format of OpenCV's drawing calls with SUBPIXEL_BITS."""
     clamped = np.clip(np.asarray(points), -FARTHEST_PIXEL, FARTHEST_PIXEL)
     return np.asarray(np.round(clamped * (1 << SUBPIXEL_BITS)), dtype=np.int32)

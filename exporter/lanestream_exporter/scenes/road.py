@@ -1,4 +1,4 @@
-"""The road: its course, and the boundaries of its lanes."""
+"""The road: its course, the boundaries of its lanes and their markings."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.camera import FloatArray
+    from lanestream.road.curve import FloatArray
 
 MarkingKind = Literal["solid", "dashed", "double", "botts"]
-PaintColour = Literal["white", "yellow"]
+PaintColor = Literal["white", "yellow"]
 Stripe = Literal["neither", "left", "right"]
 
 
 @dataclass(frozen=True)
 class Course:
-    """Where the road goes: curvature in 1/m, positive to the left, linear between knots (a chain of clothoids).
+    """The course of a road: curvature in 1/m, positive to the left, linear between knots (a chain of clothoids).
 
-    `bend` is the vertical curvature in 1/m seen from the vehicle: positive in a sag, negative before a crest.
+    `vertical_curvature` is in 1/m at the vehicle: positive in a sag, negative before a crest.
     """
 
-    spacing: float  # metres of road between two knots; the first knot is at s = 0
+    spacing: float  # meters of road between two knots; the first knot is at s = 0
     curvatures: tuple[float, ...]
-    bend: float = 0.0
+    vertical_curvature: float = 0.0
 
     def curvature(self, s: FloatArray) -> FloatArray:
-        """Curvature in 1/m at the road positions s in metres."""
+        """Returns the curvature in 1/m at the road positions s in meters."""
         knots = self.spacing * np.arange(len(self.curvatures))
         return np.interp(s, knots, self.curvatures)
 
     def bearing(self, s: float) -> float:
-        """Direction of the road at s in radians, anticlockwise from its direction at s = 0."""
+        """Returns the direction of the road at s in radians, counterclockwise from its direction at s = 0."""
         if s == 0.0:
             return 0.0
         along = np.linspace(0.0, s, max(2, math.ceil(abs(s))))
@@ -42,22 +42,22 @@ class Course:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the vehicle is in road coordinates: s along the road, u to the left of its reference line."""
+    """The pose of the vehicle in road coordinates: s along the road, u to the left of its reference line."""
 
-    s: float  # metres
-    u: float  # metres
-    heading: float  # radians, anticlockwise from the road's direction at s
+    s: float  # meters
+    u: float  # meters
+    heading: float  # radians, counterclockwise from the road's direction at s
 
 
 @dataclass(frozen=True)
 class Marking:
-    """Paint or dots on a lane boundary. Lengths in metres."""
+    """Paint or dots on a lane boundary. Lengths in meters."""
 
     kind: MarkingKind
-    color: PaintColour
+    color: PaintColor
     width: float  # of one stripe, or the diameter of a dot
     brightness: float  # of fresh paint in daylight, 0 to 1
-    wear: float  # share of the paint that is gone, 0 to 1
+    wear: float  # share of the paint that is missing, 0 to 1
     period: float = 12.0  # of dashes, or of groups of dots
     dash: float = 3.0
     phase: float = 0.0
@@ -69,26 +69,26 @@ class Marking:
 
 @dataclass(frozen=True)
 class Boundary:
-    """A lane boundary at lateral position u in metres. Without a marking it is the bare edge of the road."""
+    """A lane boundary at lateral position u in meters; without a marking it is the unmarked edge of the road."""
 
     u: float
     marking: Marking | None
 
     @property
     def kind(self) -> str:
-        """The label's kind: that of the marking, or "edge"."""
+        """Returns the kind for the label: that of the marking, or "edge"."""
         return self.marking.kind if self.marking else "edge"
 
 
 @dataclass(frozen=True)
 class Road:
-    """A road: its course and its boundaries from left to right. The index of a boundary is its identity."""
+    """A road: its course and its boundaries from left to right. The index of a boundary is its lane id."""
 
     course: Course
     boundaries: tuple[Boundary, ...]
-    lanes: tuple[float, ...]  # middles of the lanes in our direction, u in metres
+    lanes: tuple[float, ...]  # centers of the lanes in our direction, u in meters
 
     def positions(self, u: float) -> tuple[int, ...]:
-        """The position of every boundary seen from a vehicle at lateral position u: -1 and +1 bound its lane."""
+        """Returns the position of every boundary for a vehicle at lateral position u; -1 and +1 bound its lane."""
         left = sum(boundary.u > u for boundary in self.boundaries)
         return tuple(i - left if i < left else i - left + 1 for i in range(len(self.boundaries)))

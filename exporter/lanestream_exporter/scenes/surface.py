@@ -1,4 +1,4 @@
-"""The ground without paint: materials side by side, worn tracks, joints, seams, cracks and patches."""
+"""The unpainted ground: materials, wheel tracks, joints, seams, cracks and repairs."""
 
 from __future__ import annotations
 
@@ -8,53 +8,53 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from lanestream_exporter.scenes.noise import ground_noise, noise_tiles, sample
-from lanestream_exporter.scenes.view import Grid, Layer, coverage, pulse
+from lanestream_exporter.scenes.noise import ground_noise, noise_tiles, sample_noise
+from lanestream_exporter.scenes.projection import Float32Array, GroundGrid, coverage, pulse
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.camera import FloatArray
+    from lanestream.road.curve import FloatArray
 
-Colour = tuple[float, float, float]  # blue, green, red, each 0 to 1 as displayed
+Color = tuple[float, float, float]  # blue, green, red, each 0 to 1, display-referred
 
-PROFILE_REACH = 60.0  # metres to either side that the lateral profile covers
-PROFILE_STEP = 0.01  # metres
-PROFILE_BLURS = (3, 9, 27, 81)  # steps of the profile that a pixel covers at most, from near rows to far ones
+PROFILE_REACH = 60.0  # meters to either side covered by the lateral profile
+PROFILE_STEP = 0.01  # meters
+PROFILE_BLURS = (3, 9, 27, 81)  # largest footprint of a pixel in profile steps, from near rows to far ones
 
 
 @dataclass(frozen=True)
-class Material:
-    """A stretch of one material across the road, from u = low to u = high in metres."""
+class SurfaceMaterial:
+    """A strip of one material, from u = low to u = high in meters."""
 
     low: float
     high: float
-    color: Colour
+    color: Color
     roughness: float  # strength of its blotches relative to asphalt
 
 
 @dataclass(frozen=True)
-class Track:
-    """A soft darker (or, below zero, lighter) band along the road: tyre polish, oil, dust."""
+class WheelTrack:
+    """A soft dark band along the road (light if `depth` is negative): tire polish, oil, dust."""
 
     u: float
-    width: float  # one deviation, metres
+    width: float  # sigma, meters
     depth: float
 
 
 @dataclass(frozen=True)
 class Seam:
-    """A thin line along the road: a sawn joint, a tar seam, a pavement edge. Never a lane boundary."""
+    """A thin line along the road that is never a lane boundary: a sawn joint, a tar seam, a pavement edge."""
 
     u: float
-    width: float  # metres
-    depth: float  # share of light it takes away; below zero it is lighter than its surroundings
-    wander: float = 0.0  # metres of sideways wander
-    breaks: float = 0.0  # 0 for an unbroken line, 1 for mostly gaps
+    width: float  # meters
+    depth: float  # share of light that it absorbs; negative if it is lighter than its surroundings
+    wander: float = 0.0  # amplitude of the lateral wander, meters
+    breaks: float = 0.0  # from 0, an unbroken line, to 1, mostly gaps
     seed: int = 0
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Lines across the road from u = low to u = high, every `period` metres."""
+    """Lines across the road from u = low to u = high, every `period` meters."""
 
     low: float
     high: float
@@ -64,71 +64,71 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Patch:
-    """A rectangle of other pavement: a repair, a bridge deck, a change from asphalt to concrete. Metres."""
+class PavementRepair:
+    """A rectangle of different pavement: a repair, a bridge deck, a change from asphalt to concrete. Meters."""
 
     s: float
     length: float
     low: float
     high: float
     gain: float  # of brightness
-    rim: float  # darkness of the sealed joint around it, 0 for none
+    rim: float  # darkness of the sealed joint around it; 0 if there is no joint
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Everything that lies on the ground and isn't paint."""
+    """Everything on the ground except paint."""
 
-    materials: tuple[Material, ...]  # later ones lie on top
-    tracks: tuple[Track, ...] = ()
+    materials: tuple[SurfaceMaterial, ...]  # later ones cover earlier ones
+    tracks: tuple[WheelTrack, ...] = ()
     seams: tuple[Seam, ...] = ()
     joints: tuple[Joint, ...] = ()
-    patches: tuple[Patch, ...] = ()
-    grain: float = 0.04  # strength of the aggregate
+    repairs: tuple[PavementRepair, ...] = ()
+    grain: float = 0.04  # strength of the aggregate texture
     mottle: float = 0.05  # strength of blotches
     streaks: float = 0.04  # strength of marks along the direction of travel
-    cracks: float = 0.0  # 0 for none
-    pits: float = 0.0  # darkness of small holes and spots of dirt, 0 for none
+    cracks: float = 0.0  # darkness of cracks
+    pits: float = 0.0  # darkness of small holes and spots of dirt
     seed: int = 0
 
 
-def paint_ground(grid: Grid, surface: Surface) -> Layer:
-    """The unlit ground, (rows, width, 3) in blue, green, red, 0 to 1."""
+def paint_ground(grid: GroundGrid, surface: Surface) -> Float32Array:
+    """Returns the unlit ground, (rows, width, 3) in blue, green, red, 0 to 1."""
     ground, roughness = _lay_materials(grid, surface)
     gain = _texture(grid, surface, roughness) + np.float32(1.0)
     if surface.cracks > 0.0:
         gain *= _cracks(grid, surface)
-    _lay_patches(grid, surface, gain)
+    _lay_repairs(grid, surface, gain)
     _draw_joints(grid, surface, gain)
     _draw_seams(grid, surface, gain)
     ground *= np.maximum(gain, 0.05)[..., None]
     return np.asarray(ground, dtype=np.float32)
 
 
-def _lay_materials(grid: Grid, surface: Surface) -> tuple[Layer, Layer]:
-    """Colour (rows, width, 3) and roughness (rows, width) of the ground, looked up by lateral position.
+def _lay_materials(grid: GroundGrid, surface: Surface) -> tuple[Float32Array, Float32Array]:
+    """Returns color (rows, width, 3) and roughness (rows, width) of the ground, looked up by lateral position.
 
-    The profile is blurred to what a pixel covers, in a few steps from near to far rows, so that edges stay smooth.
+    The profile is blurred to the footprint of a pixel, in a few steps from near to far rows, to keep edges smooth.
     """
     profile = _profile(surface)
     index = ((grid.u + np.float32(PROFILE_REACH)) * np.float32(1.0 / PROFILE_STEP)).astype(np.int32)
     np.clip(index, 0, len(profile) - 1, out=index)
     ground = np.empty((*grid.shape, 3), np.float32)
     roughness = np.empty(grid.shape, np.float32)
-    steps = grid.x / np.float32(grid.view.camera.focal * PROFILE_STEP)
+    steps = grid.x / np.float32(grid.projection.camera.focal * PROFILE_STEP)
     levels = np.searchsorted(PROFILE_BLURS[:-1], steps)
     for level, blur in enumerate(PROFILE_BLURS):
         rows = np.flatnonzero(levels == level)
         if len(rows):
             smooth = cv2.blur(profile, (1, blur), borderType=cv2.BORDER_REPLICATE)
-            here = slice(rows[0], rows[-1] + 1)  # farther rows cover more, so the rows of a level adjoin
-            ground[here] = np.take(smooth[:, :3], index[here], axis=0)
-            roughness[here] = np.take(smooth[:, 3], index[here])
+            block = slice(rows[0], rows[-1] + 1)  # the footprint grows with distance, so a level's rows are contiguous
+            ground[block] = np.take(smooth[:, :3], index[block], axis=0)
+            roughness[block] = np.take(smooth[:, 3], index[block])
     return ground, roughness
 
 
-def _profile(surface: Surface) -> Layer:
-    """Blue, green, red and roughness by lateral position, (N, 4)."""
+def _profile(surface: Surface) -> Float32Array:
+    """Returns blue, green, red and roughness by lateral position, (N, 4)."""
     u: FloatArray = np.arange(-PROFILE_REACH, PROFILE_REACH, PROFILE_STEP)
     profile = np.ones((len(u), 4), np.float32)
     for material in surface.materials:
@@ -141,18 +141,18 @@ def _profile(surface: Surface) -> Layer:
     return profile
 
 
-def _texture(grid: Grid, surface: Surface, roughness: Layer) -> Layer:
-    """Light and dark of the ground, zero mean. Rough ground has more of it, but no marks of tyres."""
+def _texture(grid: GroundGrid, surface: Surface, roughness: Float32Array) -> Float32Array:
+    """Returns the zero-mean texture of the ground. Rough ground has more texture, but fewer tire marks."""
     tiles = noise_tiles()
     texture = ground_noise(tiles.cloud, grid, (0.035, 0.05), surface.seed)
     texture *= np.float32(surface.mottle)
     near = int(np.argmax(np.append(grid.x < 16.0, True)))
     if near < len(grid.x):
-        fine = sample(tiles.fine, grid.u[near:], grid.s[near:], (0.009, 0.012), surface.seed + 2)
+        fine = sample_noise(tiles.fine, grid.u[near:], grid.s[near:], (0.009, 0.012), surface.seed + 2)
         fine *= np.clip((16.0 - grid.x[near:]) / 8.0, 0.0, 1.0)[:, None]
         texture[near:] += np.float32(surface.grain) * fine
         if surface.pits > 0.0:
-            holes = sample(tiles.fine, grid.u[near:], grid.s[near:], (0.017, 0.024), surface.seed + 4)
+            holes = sample_noise(tiles.fine, grid.u[near:], grid.s[near:], (0.017, 0.024), surface.seed + 4)
             texture[near:] -= np.float32(surface.pits) * np.clip(holes - 1.9, 0.0, 1.0)
     texture *= roughness
     streaks = ground_noise(tiles.cloud, grid, (0.03, 0.9), surface.seed + 1)
@@ -161,34 +161,33 @@ def _texture(grid: Grid, surface: Surface, roughness: Layer) -> Layer:
     return texture
 
 
-def _cracks(grid: Grid, surface: Surface) -> Layer:
-    """A gain with dark lines where smooth noise crosses zero: closed, wandering curves, as cracks are."""
-    noise = sample(noise_tiles().cloud, grid.u, grid.s, (0.06, 0.16), surface.seed + 3)
+def _cracks(grid: GroundGrid, surface: Surface) -> Float32Array:
+    """Returns a gain that is dark along the zero crossings of smooth noise, which look like cracks."""
+    noise = sample_noise(noise_tiles().cloud, grid.u, grid.s, (0.06, 0.16), surface.seed + 3)
     footprint = np.maximum(0.012, grid.along * 0.35)[:, None]
     depth = np.minimum(1.0, 0.02 / footprint) * surface.cracks
     lines = np.maximum(0.0, 1.0 - np.abs(noise) / (3.0 * footprint))
     return np.asarray(1.0 - depth * lines, dtype=np.float32)
 
 
-def _lay_patches(grid: Grid, surface: Surface, gain: Layer) -> None:
+def _lay_repairs(grid: GroundGrid, surface: Surface, gain: Float32Array) -> None:
     flat = gain.reshape(-1)
-    for patch in surface.patches:
-        if not grid.view.spans(patch.s, patch.s + patch.length):
+    for repair in surface.repairs:
+        if not grid.projection.overlaps(repair.s, repair.s + repair.length):
             continue
-        band = grid.band(patch.low, patch.high)
-        middle = np.float32(patch.s + patch.length / 2.0)
-        inside = coverage(band.s - middle, patch.length, band.along)
-        centre = np.float32((patch.low + patch.high) / 2.0)
-        sideways = coverage(band.u - centre, patch.high - patch.low, band.across)
-        inside *= sideways
-        flat[band.index] *= 1.0 + np.float32(patch.gain - 1.0) * inside
-        if patch.rim > 0.0:
-            core = coverage(band.s - middle, patch.length - 0.08, band.along)
-            core *= coverage(band.u - centre, patch.high - patch.low - 0.08, band.across)
-            flat[band.index] *= 1.0 - np.float32(patch.rim) * (inside - core)
+        band = grid.band(repair.low, repair.high)
+        center_s = np.float32(repair.s + repair.length / 2.0)
+        inside = coverage(band.s - center_s, repair.length, band.along)
+        center_u = np.float32((repair.low + repair.high) / 2.0)
+        inside *= coverage(band.u - center_u, repair.high - repair.low, band.across)
+        flat[band.index] *= 1.0 + np.float32(repair.gain - 1.0) * inside
+        if repair.rim > 0.0:
+            core = coverage(band.s - center_s, repair.length - 0.08, band.along)
+            core *= coverage(band.u - center_u, repair.high - repair.low - 0.08, band.across)
+            flat[band.index] *= 1.0 - np.float32(repair.rim) * (inside - core)
 
 
-def _draw_joints(grid: Grid, surface: Surface, gain: Layer) -> None:
+def _draw_joints(grid: GroundGrid, surface: Surface, gain: Float32Array) -> None:
     flat = gain.reshape(-1)
     for joint in surface.joints:
         band = grid.band(joint.low, joint.high)
@@ -198,16 +197,18 @@ def _draw_joints(grid: Grid, surface: Surface, gain: Layer) -> None:
         )
 
 
-def _draw_seams(grid: Grid, surface: Surface, gain: Layer) -> None:
+def _draw_seams(grid: GroundGrid, surface: Surface, gain: Float32Array) -> None:
     flat, cloud = gain.reshape(-1), noise_tiles().cloud
     for seam in surface.seams:
         reach = seam.width + 3.0 * seam.wander
         band = grid.band(seam.u - reach, seam.u + reach)
         offset = band.u - np.float32(seam.u)
         if seam.wander > 0.0:
-            offset -= np.float32(seam.wander) * sample(cloud, np.zeros_like(band.s), band.s, (1.0, 0.12), seam.seed)
+            offset -= np.float32(seam.wander) * sample_noise(
+                cloud, np.zeros_like(band.s), band.s, (1.0, 0.12), seam.seed
+            )
         depth = coverage(offset, seam.width, band.across) * np.float32(seam.depth)
         if seam.breaks > 0.0:
-            noise = sample(cloud, np.zeros_like(band.s), band.s, (1.0, 0.3), seam.seed + 1)
+            noise = sample_noise(cloud, np.zeros_like(band.s), band.s, (1.0, 0.3), seam.seed + 1)
             depth *= np.clip((noise + 1.5 - 3.0 * seam.breaks) * 4.0, 0.0, 1.0)
         flat[band.index] *= 1.0 - depth

@@ -1,11 +1,11 @@
-"""Peers: two well-known classical pipelines that run in the same evaluation, on the same frames, for scale.
+"""Baselines: two well-known classical pipelines, evaluated on the same frames for comparison.
 
-They are no part of the product. Each is written from the general idea of its kind, in about the usual length and with
-usual settings, scaled with the image; of those, the ones that did best on the training split. Both look at every frame
-afresh and report the ego lane's boundaries alone.
+They are not part of the product. Each implements the general idea of its kind at about the usual length. The settings
+are the common ones that did best on the training split, scaled with the image. Both process every frame independently
+and report only the boundaries of the ego lane.
 """
 
-from lanestream_exporter.evaluation.baselines.hough_lines import HoughLinesPeer
-from lanestream_exporter.evaluation.baselines.sliding_window import SlidingWindowPeer
+from lanestream_exporter.evaluation.baselines.hough_lines import HoughLinesBaseline
+from lanestream_exporter.evaluation.baselines.sliding_window import SlidingWindowBaseline
 
-__all__ = ["HoughLinesPeer", "SlidingWindowPeer"]
+__all__ = ["HoughLinesBaseline", "SlidingWindowBaseline"]

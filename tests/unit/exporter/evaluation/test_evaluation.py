@@ -1,4 +1,4 @@
-"""The rules of evaluation on cases made by hand: the ego pair, the field's metrics, intervals, steadiness."""
+"""The rules of evaluation on handmade cases: the ego pair, benchmark metrics, intervals, steadiness."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ from lanestream.road.curve import Curve
 from lanestream.road.results import Candidate
 from lanestream.road.view import RoadView
 from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
-from lanestream_exporter.evaluation import culane, tusimple
-from lanestream_exporter.evaluation.bootstrap import blocks, intervals, measured, ratio
-from lanestream_exporter.evaluation.boundaries import Found, match, match_ego
+from lanestream_exporter.evaluation.benchmarks import (
+    TUSIMPLE_ROWS,
+    culane_counts,
+    tusimple_frame,
+    tusimple_score,
+)
+from lanestream_exporter.evaluation.bootstrap import blocks, intervals, point_estimates, ratio
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary, match, match_ego
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
 from lanestream_exporter.evaluation.lateral import lateral_figures
-from lanestream_exporter.evaluation.outcomes import RULES, Outcome, judge
+from lanestream_exporter.evaluation.outcomes import RULES, FrameOutcome, judge
 from lanestream_exporter.evaluation.steadiness import steadiness
 
 Array = NDArray[np.float64]
-
-ROWS = np.arange(240.0, 711.0, 10.0)
 
 
 def curve(b: float, v: float = 640.0) -> Curve:
@@ -42,8 +45,8 @@ def frame(*lanes: LabelledLane, coverage: Coverage = PARTIAL, group: str = "driv
     return LabelledFrame(1280, 720, lanes, group, f"{group}#{number}", coverage)
 
 
-def found(b: float, position: int, v: float = 640.0, track_id: int | None = None) -> Found:
-    return Found(curve(b, v), 280.0, 719.0, position, track_id)
+def report(b: float, position: int, v: float = 640.0, track_id: int | None = None) -> ReportedBoundary:
+    return ReportedBoundary(curve(b, v), 280.0, 719.0, position, track_id)
 
 
 PAIR = label(-1.1), label(1.1)
@@ -52,50 +55,53 @@ PAIR = label(-1.1), label(1.1)
 # The ego pair
 
 
-def test_an_ego_report_beside_its_label_is_wrong_even_where_nobody_labelled_to_the_side() -> None:
-    verdict = match_ego([found(-2.2, -1), found(1.1, 1)], frame(*PAIR))
-    assert (len(verdict.pairs), verdict.wrong, verdict.missed) == (1, 1, 1)
-    assert match([found(-2.2, -1), found(1.1, 1)], PAIR, frame(*PAIR)).wrong == 0
+def test_an_ego_report_away_from_its_label_is_wrong_even_on_an_incomplete_side() -> None:
+    matches = match_ego([report(-2.2, -1), report(1.1, 1)], frame(*PAIR))
+    assert (len(matches.matches), matches.wrong, matches.missed) == (1, 1, 1)
+    assert match([report(-2.2, -1), report(1.1, 1)], PAIR, frame(*PAIR)).wrong == 0
 
 
 def test_an_ego_report_must_be_on_its_own_side() -> None:
-    verdict = match_ego([found(-1.1, 1), found(1.1, -1)], frame(*PAIR))
-    assert (len(verdict.pairs), verdict.wrong, verdict.missed) == (0, 2, 2)
+    matches = match_ego([report(-1.1, 1), report(1.1, -1)], frame(*PAIR))
+    assert (len(matches.matches), matches.wrong, matches.missed) == (0, 2, 2)
 
 
-def test_an_absent_side_counts_where_the_ego_lane_is_wholly_labelled() -> None:
+def test_an_absent_side_counts_if_the_ego_lane_is_completely_labeled() -> None:
     alone = label(1.1, position=1)
-    verdict = match_ego([found(1.1, 1)], frame(alone, coverage=EGO_LANE))
-    assert (len(verdict.pairs), verdict.wrong, verdict.missed, verdict.absent) == (1, 0, 0, 1)
-    assert match_ego([found(1.1, 1)], frame(alone)).absent == 0
-    reported = match_ego([found(-1.1, -1)], frame(alone, coverage=EGO_LANE))
+    matches = match_ego([report(1.1, 1)], frame(alone, coverage=EGO_LANE))
+    assert (len(matches.matches), matches.wrong, matches.missed, matches.absent) == (1, 0, 0, 1)
+    assert match_ego([report(1.1, 1)], frame(alone)).absent == 0
+    reported = match_ego([report(-1.1, -1)], frame(alone, coverage=EGO_LANE))
     assert (reported.wrong, reported.missed, reported.absent) == (1, 1, 0)
 
 
 def test_boundary_figures_of_two_frames() -> None:
     outcomes = [
-        Outcome(frame(*PAIR, coverage=WHOLE), (found(-1.1, -1, 650.0), found(1.1, 1))),
-        Outcome(frame(*PAIR, coverage=WHOLE), (found(-1.1, -1), found(0.3, 1))),
+        FrameOutcome(frame(*PAIR, coverage=WHOLE), (report(-1.1, -1, 650.0), report(1.1, 1))),
+        FrameOutcome(frame(*PAIR, coverage=WHOLE), (report(-1.1, -1), report(0.3, 1))),
     ]
     ego = boundary_figures(outcomes)["ego"]
     assert (ego["right"], ego["wrong"], ego["missed"], ego["absent"]) == (3, 1, 1, 0)
     assert (ego["precision"], ego["recall"], ego["f1"]) == (0.75, 0.75, 0.75)
     assert (ego["jaccard"], ego["accuracy"], ego["false_per_frame"]) == (0.6, 0.6, 0.5)
-    off = 5.0 / np.hypot(1.0, 1.1)
-    assert ego["mean_error_px_640"] == pytest.approx(off / 3.0, abs=1e-3)
+    distance = 5.0 / np.hypot(1.0, 1.1)
+    assert ego["mean_error_px_640"] == pytest.approx(distance / 3.0, abs=1e-3)
     assert ego["median_error_px_640"] == 0.0
-    seen = [m for m in ego["error_by_depth"]["mean_px_640"] if m is not None]
-    assert len(seen) >= 9
-    assert seen == pytest.approx([off / 3.0] * len(seen), abs=0.05)
-    assert sum(ego["error_by_depth"]["samples"]) == 3 * 58  # of 64 rows, those below row 280
+    means = [m for m in ego["error_by_depth"]["mean_px_640"] if m is not None]
+    assert len(means) >= 9
+    assert means == pytest.approx([distance / 3.0] * len(means), abs=0.05)
+    assert sum(ego["error_by_depth"]["samples"]) == 3 * 58  # those of 64 rows that are below row 280
 
 
-def test_lateral_errors_by_the_formula_and_straight_on() -> None:
-    bent = Curve(200.0, (640.0, -1.1, 2000.0))
-    outcomes = [Outcome(frame(*PAIR, number=i), (Found(bent, 280.0, 719.0, -1), found(1.1, 1))) for i in range(2)]
-    near, far = (lateral_figures(outcomes)[place] for place in ("10m", "30m"))
+def test_lateral_errors_of_the_curve_and_of_its_straight_extrapolation() -> None:
+    curved = Curve(200.0, (640.0, -1.1, 2000.0))
+    outcomes = [
+        FrameOutcome(frame(*PAIR, number=i), (ReportedBoundary(curved, 280.0, 719.0, -1), report(1.1, 1)))
+        for i in range(2)
+    ]
+    near, far = (lateral_figures(outcomes)[distance] for distance in ("10m", "30m"))
     row = 200.0 + 0.5 / np.tan(np.deg2rad(32.5)) * 1280 * 1.45 / 30.0
-    assert (far["labelled"], far["told"], far["reached"]) == (4, 4, 0)
+    assert (far["labeled"], far["reported"], far["reached"]) == (4, 4, 0)
     assert far["mean_px_640"] == pytest.approx(0.5 * 0.5 * 2000.0 / (row - 200.0), rel=0.02)
     straight = 2000.0 / 80.0 - (row - 280.0) * 2000.0 / 80.0**2
     assert far["straight_px_640"] == pytest.approx(0.5 * 0.5 * straight, rel=0.02)
@@ -103,8 +109,8 @@ def test_lateral_errors_by_the_formula_and_straight_on() -> None:
     assert near["mean_px_640"] == near["straight_px_640"]
 
 
-def test_figures_of_nothing_are_null() -> None:
-    figures = boundary_figures([Outcome(frame(coverage=WHOLE), ())])
+def test_figures_without_data_are_none() -> None:
+    figures = boundary_figures([FrameOutcome(frame(coverage=WHOLE), ())])
     assert figures["all"]["precision"] is None
     assert figures["all"]["mean_error_px_640"] is None
     assert figures["ego"]["accuracy"] == 1.0
@@ -120,7 +126,7 @@ def lane(x: float, first: int = 0, last: int = 48) -> Array:
 
 
 def score(reported: list[Array], labels: list[Array]) -> tuple[float, float, float]:
-    result = tusimple.score(reported, labels, ROWS)
+    result = tusimple_score(reported, labels, TUSIMPLE_ROWS)
     return result.accuracy, result.fp, result.fn
 
 
@@ -130,7 +136,7 @@ def test_tusimple_threshold_is_below_20_pixels() -> None:
 
 
 def test_tusimple_threshold_grows_with_the_labels_angle() -> None:
-    slanted = 100.0 + 1.5 * (ROWS - 240.0)
+    slanted = 100.0 + 1.5 * (TUSIMPLE_ROWS - 240.0)
     limit = 20.0 * np.hypot(1.0, 1.5)
     assert score([slanted + limit - 0.1], [slanted])[0] == 1.0
     assert score([slanted + limit + 0.1], [slanted])[0] == 0.0
@@ -151,12 +157,12 @@ def test_tusimple_needs_85_percent_of_rows() -> None:
 
 
 def test_tusimple_is_not_one_to_one() -> None:
-    """One report serves two labels: then there are more matches than reports, and FP is negative, as officially."""
+    """One report matches two labels, so there are more matches than reports and FP is negative, as in the original."""
     accuracy, fp, fn = score([lane(110.0)], [lane(100.0), lane(120.0)])
     assert (accuracy, fp, fn) == (1.0, -1.0, 0.0)
 
 
-def test_tusimple_more_than_two_reports_too_many_void_a_frame() -> None:
+def test_tusimple_more_than_two_extra_reports_void_a_frame() -> None:
     reports = [lane(100.0 + 200.0 * i) for i in range(4)]
     assert score(reports[:3], [lane(100.0)]) == (1.0, pytest.approx(2 / 3), 0.0)
     assert score(reports, [lane(100.0)]) == (0.0, 0.0, 1.0)
@@ -176,21 +182,21 @@ def test_tusimple_without_reports_or_labels() -> None:
     assert score([lane(100.0)], []) == (0.0, 1.0, 0.0)
 
 
-def test_tusimple_of_frames_scales_and_extends_what_is_reported() -> None:
+def test_tusimple_frames_are_scaled_and_reports_extrapolated() -> None:
     wanted = frame(label(-1.1), label(1.1))
-    perfect = tusimple.score_frame([found(-1.1, -1), found(1.1, 1)], wanted)
-    assert perfect.accuracy == 1.0  # though the reports end at row 280 and the labels go on to 240
+    perfect = tusimple_frame([report(-1.1, -1), report(1.1, 1)], wanted)
+    assert perfect.accuracy == 1.0  # although the reports end at row 280 and the labels at 240
     half = LabelledFrame(640, 360, tuple(LabelledLane(i.points / 2.0) for i in wanted.lanes), "d", "d#0")
-    reports = [Found(Curve(100.0, (320.0, b, 0.0)), 140.0, 359.0, s) for b, s in ((-1.1, -1), (1.1, 1))]
-    assert tusimple.score_frame(reports, half) == perfect
+    reports = [ReportedBoundary(Curve(100.0, (320.0, b, 0.0)), 140.0, 359.0, s) for b, s in ((-1.1, -1), (1.1, 1))]
+    assert tusimple_frame(reports, half) == perfect
     cut = [replace(report, farthest=300.0) for report in reports]
-    assert tusimple.score_frame(cut, half).accuracy < 0.5
+    assert tusimple_frame(cut, half).accuracy < 0.5
 
 
-def test_boundaries_beyond_the_next_lanes_are_not_handed_in() -> None:
-    reports = [found(-1.1, -1), found(1.1, 1), found(5.0, 3)]
-    assert tusimple.score_frame(reports, frame(*PAIR)).fp == 0.0
-    assert tusimple.score_frame([*reports, found(3.3, 2)], frame(*PAIR)).fp == pytest.approx(1 / 3)
+def test_boundaries_beyond_the_adjacent_lanes_are_not_submitted() -> None:
+    reports = [report(-1.1, -1), report(1.1, 1), report(5.0, 3)]
+    assert tusimple_frame(reports, frame(*PAIR)).fp == 0.0
+    assert tusimple_frame([*reports, report(3.3, 2)], frame(*PAIR)).fp == pytest.approx(1 / 3)
 
 
 # CULane style
@@ -203,39 +209,39 @@ def upright(x: float, top: float = 100.0) -> Array:
 
 
 def counts(reported: list[Array], labels: list[Array]) -> tuple[int, int, int]:
-    result = culane.count(reported, labels, SIZE)
+    result = culane_counts(reported, labels, SIZE)
     return result.tp, result.fp, result.fn
 
 
 def test_stripes_30_pixels_wide_overlap_by_half_up_to_10_pixels() -> None:
-    """Shifted by d, the overlap of two stripes is (30 - d) / (30 + d): above one half for d below 10."""
+    """Shifted by d, the IoU of two stripes is (30 - d) / (30 + d), which is above 0.5 for d below 10."""
     assert counts([upright(507.0)], [upright(500.0)]) == (1, 0, 0)
     assert counts([upright(513.0)], [upright(500.0)]) == (0, 1, 1)
 
 
 def test_stripes_are_scaled_with_the_width() -> None:
     labels, size = [upright(500.0) / 2.0], (820, 295)
-    assert culane.count([labels[0] + [3.0, 0.0]], labels, size).tp == 1
-    assert culane.count([labels[0] + [7.0, 0.0]], labels, size).tp == 0
+    assert culane_counts([labels[0] + [3.0, 0.0]], labels, size).tp == 1
+    assert culane_counts([labels[0] + [7.0, 0.0]], labels, size).tp == 0
 
 
-def test_a_stripe_matches_one_label_and_a_short_one_none() -> None:
+def test_a_stripe_matches_one_label_and_a_short_stripe_none() -> None:
     assert counts([upright(500.0), upright(503.0)], [upright(500.0)]) == (1, 1, 0)
     assert counts([upright(500.0, 400.0)], [upright(500.0)]) == (0, 1, 1)
     assert counts([], [upright(500.0)]) == (0, 0, 1)
     assert counts([upright(500.0)], []) == (0, 1, 0)
 
 
-def test_stripes_are_matched_so_that_most_overlaps() -> None:
-    """The nearest pair first would leave 495 with 512, too far apart."""
+def test_stripes_are_matched_for_the_largest_total_overlap() -> None:
+    """Matching the nearest pair first would leave 495 with 512, which are too far apart."""
     assert counts([upright(505.0), upright(495.0)], [upright(502.0), upright(512.0)]) == (2, 0, 0)
 
 
-def test_of_the_ego_pair_nothing_else_counts() -> None:
+def test_ego_pair_figures_ignore_other_boundaries() -> None:
     outer = label(3.0)
     outcomes = [
-        Outcome(frame(*PAIR, outer), (found(-1.1, -1), found(1.1, 1), found(2.2, 2))),
-        Outcome(frame(label(3.0, position=2)), (found(1.1, 1),)),
+        FrameOutcome(frame(*PAIR, outer), (report(-1.1, -1), report(1.1, 1), report(2.2, 2))),
+        FrameOutcome(frame(label(3.0, position=2)), (report(1.1, 1),)),
     ]
     figures = field_figures(outcomes)
     assert (figures["tusimple"]["frames"], figures["tusimple"]["labels"]) == (2, 4)
@@ -248,8 +254,8 @@ def test_of_the_ego_pair_nothing_else_counts() -> None:
 
 def test_field_figures_over_a_set() -> None:
     outcomes = [
-        Outcome(frame(*PAIR), (found(-1.1, -1), found(1.1, 1))),
-        Outcome(frame(*PAIR), (found(-1.1, -1),)),
+        FrameOutcome(frame(*PAIR), (report(-1.1, -1), report(1.1, 1))),
+        FrameOutcome(frame(*PAIR), (report(-1.1, -1),)),
     ]
     figures = field_figures(outcomes)
     assert figures["tusimple"]["accuracy"] == 0.75
@@ -264,13 +270,13 @@ def test_field_figures_over_a_set() -> None:
 def test_candidates_under_both_rules() -> None:
     view = RoadView(1280, 720, 200.0)
     labels = frame(*PAIR, coverage=WHOLE)
-    # Across the line 10 px are 6.7 px, 52 px are 35 px (of 1280) and 90 px are 60 px.
+    # Shifts of 10, 52 and 90 px are 6.7, 35 and 60 px across the line, at 1280 wide.
     shifts = (0.0, 10.0, 52.0, 90.0)
     candidates = tuple(Candidate(curve(-1.1, 640.0 + v), 252.0, 719.0, 1.0) for v in shifts)
     prepared = Prepared(np.zeros((720, 1280, 3), np.uint8), (), view, candidates)
     outputs = np.array([[0.05, 0.95], [0.75, 0.25], [0.05, 0.95], [0.85, 0.15]], np.float32)
     judged = judge(prepared, outputs, replace(prepared, candidates=candidates[::-1]), labels)
-    figures = candidate_figures([Outcome(labels, (), judged)], 0.5)
+    figures = candidate_figures([FrameOutcome(labels, (), judged)], 0.5)
     assert figures["far_40"]["confusion"] == {"tp": 1, "fp": 0, "fn": 1, "tn": 1}
     assert (figures["far_40"]["unsure"], figures["far_30"]["unsure"]) == (1, 0)
     assert figures["far_30"]["confusion"] == {"tp": 1, "fp": 1, "fn": 1, "tn": 1}
@@ -280,14 +286,14 @@ def test_candidates_under_both_rules() -> None:
     bins = figures["far_40"]["calibration"]["bins"]
     assert [b["count"] for b in bins] == [0, 1, 1, 0, 0, 0, 0, 0, 0, 1]
     assert figures["far_40"]["calibration"]["expected_error"] == pytest.approx((0.05 + 0.75 + 0.15) / 3, abs=1e-3)
-    assert figures["decided"] == {rule: figures[rule] for rule in RULES}, "without a glance the classifier decides"
-    word = replace(judged, decided=np.array([0.95, 0.75, 0.95, 0.15]))
-    decided = candidate_figures([Outcome(labels, (), word)], 0.5)
+    assert figures["decided"] == {rule: figures[rule] for rule in RULES}, "without a prior the classifier decides"
+    with_prior = replace(judged, decided=np.array([0.95, 0.75, 0.95, 0.15]))
+    decided = candidate_figures([FrameOutcome(labels, (), with_prior)], 0.5)
     assert decided["decided"]["far_40"]["confusion"] == {"tp": 2, "fp": 0, "fn": 0, "tn": 1}
     assert decided["far_40"] == figures["far_40"]
     recall = figures["proposal_recall"]["ego"]
     assert recall["labels"] == 2
-    assert recall["found"][:4] == [0, 0, 1, 1]  # the last but one of the reversed list is the first true one
+    assert recall["found"][:4] == [0, 0, 1, 1]  # the third of the reversed list is the first true one
     assert recall["recall_16"] == 0.5
 
 
@@ -298,7 +304,7 @@ def rates(sums: Array) -> dict[str, Array]:
     return {"share": ratio(sums[:, 0], sums[:, 1])}
 
 
-def test_the_unit_is_a_block_of_neighbours_and_a_drive_where_there_are_many() -> None:
+def test_blocks_are_neighboring_frames_or_whole_drives_if_there_are_many() -> None:
     stills = [replace(frame(group=g), source=f"{g}/{i}.jpg") for g in "ab" for i in range(7)]
     assert blocks(stills).tolist() == [0] * 5 + [1] * 2 + [2] * 5 + [3] * 2
     clip = [frame(number=15 * i) for i in range(9)]
@@ -308,16 +314,16 @@ def test_the_unit_is_a_block_of_neighbours_and_a_drive_where_there_are_many() ->
     assert blocks(drives).tolist() == [i // 8 for i in range(80)]
 
 
-def test_intervals_are_repeatable_and_as_wide_as_the_blocks_say() -> None:
+def test_intervals_are_reproducible_and_depend_on_the_blocks() -> None:
     frames = [replace(frame(), source=f"{i}.jpg") for i in range(200)]
     alternating = np.array([[i % 2, 1.0] for i in range(200)])
     grouped = np.array([[(i // 5) % 2, 1.0] for i in range(200)])
     assert intervals(grouped, frames, rates) == intervals(grouped, frames, rates)
-    assert measured(grouped, frames, rates) == {"share": 0.5}
+    assert point_estimates(grouped, frames, rates) == {"share": 0.5}
     wide, narrow = intervals(grouped, frames, rates)["share"], intervals(alternating, frames, rates)["share"]
     assert wide is not None
     assert narrow is not None
-    # 40 blocks of 0 or 1: 1.96 times 0.5 / sqrt(40) to either side.
+    # 40 blocks of 0 or 1: plus or minus 1.96 times 0.5 / sqrt(40).
     assert wide == pytest.approx([0.5 - 0.155, 0.5 + 0.155], abs=0.03)
     assert narrow[1] - narrow[0] < 0.3 * (wide[1] - wide[0])
 
@@ -331,23 +337,26 @@ def test_one_block_has_no_interval() -> None:
 
 
 def test_steadiness_of_a_clip() -> None:
-    shaken = [640.0 + (8.0 if i % 2 else 0.0) for i in range(10)]
-    reported = [(found(-1.1, -1, v, track_id=7), found(1.1, 1, track_id=8)) for v in shaken]
-    reported[9] = (found(-1.1, -1, track_id=7),)
+    jittering = [640.0 + (8.0 if i % 2 else 0.0) for i in range(10)]
+    reported = [(report(-1.1, -1, v, track_id=7), report(1.1, 1, track_id=8)) for v in jittering]
+    reported[9] = (report(-1.1, -1, track_id=7),)
     labels = [label(-1.1, position=-1, lane_id=1), label(1.1, position=1, lane_id=2)]
-    labelled = [Outcome(frame(*labels, number=i), reported[i]) for i in (0, 4, 8)]
+    labelled = [FrameOutcome(frame(*labels, number=i), reported[i]) for i in (0, 4, 8)]
     figures = steadiness(reported, labelled, (1280, 720))
     assert (figures["frames"], figures["both_ego_frames"], figures["both_ego"]) == (10, 9, 0.9)
-    # Left: second differences of plus and minus 8 px at 640 wide; right: none.
+    # Left: second differences of plus and minus 8 px at 640 wide; right: zero.
     assert figures["jitter_samples"] == 3 * (8 + 7)
     assert figures["jitter_px_640"] == pytest.approx(8.0 * np.sqrt(8 / 15), abs=0.3)
     assert figures["id_switches"] == 0
-    swapped = [*labelled[:2], Outcome(labelled[2].frame, (found(-1.1, -1, track_id=9), found(1.1, 1, track_id=8)))]
+    swapped = [
+        *labelled[:2],
+        FrameOutcome(labelled[2].frame, (report(-1.1, -1, track_id=9), report(1.1, 1, track_id=8))),
+    ]
     assert steadiness(reported, swapped, (1280, 720))["id_switches"] == 1
 
 
-def test_what_has_no_identity_can_not_switch_it() -> None:
-    reported = [(found(-1.1, -1), found(1.1, 1))]
-    figures = steadiness(reported, [Outcome(frame(*PAIR), reported[0])], (1280, 720))
+def test_reports_without_track_ids_have_no_identity_switches() -> None:
+    reported = [(report(-1.1, -1), report(1.1, 1))]
+    figures = steadiness(reported, [FrameOutcome(frame(*PAIR), reported[0])], (1280, 720))
     assert figures["id_switches"] is None
     assert figures["jitter_px_640"] is None

@@ -1,4 +1,4 @@
-"""A whole evaluation of rendered frames: models and peers, figures and their documentation, the report, the command."""
+"""A complete evaluation of rendered frames: models, baselines, documented figures, the report, the command."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from lanestream.errors import LabelError
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame
 from lanestream_exporter.datasets.splits import LabelledClip
-from lanestream_exporter.evaluation.baselines import HoughLinesPeer, SlidingWindowPeer
+from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
 from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, Material, evaluate
-from lanestream_exporter.evaluation.methods import Model, Peer
+from lanestream_exporter.evaluation.methods import Baseline, ServedModel
 from lanestream_exporter.evaluation.report import write_report
 from lanestream_exporter.evaluation.tables import tables
 from lanestream_exporter.evaluation_commands import evaluate as command
 from lanestream_exporter.scenes import Drive, render_still, sample_clip, write_clip
 
 DOCUMENT = Path(__file__).parents[4] / "docs" / "evaluation.md"
-PEERS = [HoughLinesPeer(), SlidingWindowPeer()]
+BASELINES = [HoughLinesBaseline(), SlidingWindowBaseline()]
 
 
 def still(seed: int, width: int = 640, height: int = 360) -> tuple[LabelledFrame, Image]:
@@ -40,7 +40,7 @@ def still(seed: int, width: int = 640, height: int = 360) -> tuple[LabelledFrame
 
 
 def straight_road(width: int, height: int) -> Image:
-    """Two solid white lines on dark asphalt that meet at 45 % of the height."""
+    """Returns two solid white lines on dark asphalt that meet at 45 % of the height."""
     image = np.full((height, width, 3), 60, np.uint8)
     horizon = 0.45 * height
     for b in (-1.0, 1.0):
@@ -50,10 +50,10 @@ def straight_road(width: int, height: int) -> Image:
     return image
 
 
-@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: type(peer).__name__)
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda baseline: type(baseline).__name__)
 @pytest.mark.parametrize(("width", "height"), [(640, 360), (1280, 720), (960, 540)])
-def test_peers_find_a_straight_road_at_any_size(peer: Any, width: int, height: int) -> None:
-    found = {boundary.position: boundary for boundary in peer.find(straight_road(width, height))}
+def test_baselines_find_a_straight_road_at_any_size(baseline: Any, width: int, height: int) -> None:
+    found = {boundary.position: boundary for boundary in baseline.detect(straight_road(width, height))}
     assert set(found) == {-1, 1}
     for side, boundary in found.items():
         rows = np.linspace(boundary.top + 0.02 * height, 0.9 * height, 8)
@@ -61,15 +61,15 @@ def test_peers_find_a_straight_road_at_any_size(peer: Any, width: int, height: i
         np.testing.assert_allclose(boundary.curve.x(rows), expected, atol=0.012 * width)
 
 
-@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: type(peer).__name__)
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda baseline: type(baseline).__name__)
 @pytest.mark.parametrize("level", [0, 128, 255])
-def test_peers_find_nothing_where_nothing_is(peer: Any, level: int) -> None:
-    assert peer.find(np.full((360, 640, 3), level, np.uint8)) == ()
+def test_baselines_find_nothing_in_a_uniform_image(baseline: Any, level: int) -> None:
+    assert baseline.detect(np.full((360, 640, 3), level, np.uint8)) == ()
 
 
-@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: type(peer).__name__)
-def test_peers_see_some_rendered_highways(peer: Any) -> None:
-    right = sum(len(match_ego(peer.find(image), frame).pairs) for frame, image in map(still, range(24, 34)))
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda baseline: type(baseline).__name__)
+def test_baselines_find_boundaries_on_some_rendered_highways(baseline: Any) -> None:
+    right = sum(len(match_ego(baseline.detect(image), frame).matches) for frame, image in map(still, range(24, 34)))
     assert right >= 4
 
 
@@ -86,7 +86,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> LabelledClip:
 @pytest.fixture(scope="module")
 def evaluation(clip: LabelledClip) -> Evaluation:
     frames = [still(seed) for seed in range(24, 28)]
-    methods = [Model(load_engine(provider="cpu")), *map(Peer, PEERS)]
+    methods = [ServedModel(load_engine(provider="cpu")), *map(Baseline, BASELINES)]
     return evaluate(methods, Material("rendered", lambda: iter(frames), (clip,)))
 
 
@@ -95,12 +95,12 @@ def figures(evaluation: Evaluation) -> dict[str, Any]:
     return evaluation.figures()
 
 
-def test_all_methods_see_the_same_frames(evaluation: Evaluation, figures: dict[str, Any]) -> None:
+def test_all_methods_process_the_same_frames(evaluation: Evaluation, figures: dict[str, Any]) -> None:
     kinds = [method["kind"] for method in figures["methods"].values()]
-    guides = [method["guided_by"] for method in figures["methods"].values()]
-    assert guides[0].startswith("lanestream-regressor")
-    assert guides[1:] == [None, None]
-    assert kinds == ["classifier", "peer", "peer"]
+    regressors = [method["regressor"] for method in figures["methods"].values()]
+    assert regressors[0].startswith("lanestream-regressor")
+    assert regressors[1:] == [None, None]
+    assert kinds == ["classifier", "baseline", "baseline"]
     for name, kind in zip(figures["methods"], kinds, strict=True):
         part = figures["images"][name][OVERALL]
         assert part["boundaries"]["ego"]["frames"] == part["field"]["tusimple"]["frames"] == 4
@@ -109,8 +109,8 @@ def test_all_methods_see_the_same_frames(evaluation: Evaluation, figures: dict[s
         tracked = figures["clips"][name]["road"]["tracked"]["ego"]
         assert tracked["frames"] == figures["clips"][name]["road"]["alone"]["ego"]["frames"] == 8
         assert tracked["right"] + tracked["missed"] == 16
-        peers_have_no_memory = figures["clips"][name]["road"]["alone"]["ego"]["right"] == tracked["right"]
-        assert peers_have_no_memory or kind != "peer"
+        same_without_tracker = figures["clips"][name]["road"]["alone"]["ego"]["right"] == tracked["right"]
+        assert same_without_tracker or kind != "baseline"
 
 
 def test_the_same_frames_give_the_same_figures(evaluation: Evaluation, figures: dict[str, Any]) -> None:
@@ -119,14 +119,14 @@ def test_the_same_frames_give_the_same_figures(evaluation: Evaluation, figures: 
 
 
 def expanded(pattern: str) -> Iterator[str]:
-    """`a.{b,c}` as `a.b` and `a.c`."""
+    """Yields `a.b` and `a.c` for `a.{b,c}`."""
     parts = [part.split(",") for part in re.split(r"[{}]", pattern)]
     fixed = [[",".join(part)] if index % 2 == 0 else part for index, part in enumerate(parts)]
     return map("".join, itertools.product(*fixed))
 
 
 def documented() -> set[str]:
-    """The keys of the tables, each below every base that the paragraph before its table names."""
+    """Returns the keys of the tables, each below every base that the paragraph before its table names."""
     text = DOCUMENT.read_text(encoding="utf-8")
     keys: set[str] = set()
     bases = [""]
@@ -152,11 +152,11 @@ def written(value: Any, path: str = "") -> Iterator[str]:
         yield path
 
 
-def test_the_documented_keys_are_the_written_ones(figures: dict[str, Any]) -> None:
+def test_the_documented_keys_are_the_written_keys(figures: dict[str, Any]) -> None:
     assert sorted(documented()) == sorted(set(written(figures)))
 
 
-def test_the_report_stands_alone(evaluation: Evaluation, figures: dict[str, Any], tmp_path: Path) -> None:
+def test_the_report_is_self_contained(evaluation: Evaluation, figures: dict[str, Any], tmp_path: Path) -> None:
     page = write_report(tmp_path / "new" / "folder", evaluation, figures).read_text(encoding="utf-8")
     assert page.count("<svg") == page.count("</svg>") == 5
     assert page.count("data:image/jpeg;base64,") == 4
@@ -180,17 +180,17 @@ def test_the_worst_frames_come_first(evaluation: Evaluation, figures: dict[str, 
 
 def test_the_tables_name_every_method_and_drive(figures: dict[str, Any]) -> None:
     made = list(tables(figures))
-    drives = len(figures["images"][PEERS[0].name])
+    drives = len(figures["images"][BASELINES[0].name])
     assert drives == 5
     assert [table.row_count for table in made] == [2 * drives, 2 * drives, 4 * drives, 8, 8, *[4 * drives] * 3]
 
 
-def test_nothing_labelled_is_told() -> None:
+def test_a_dataset_without_labels_is_an_error() -> None:
     with pytest.raises(LabelError, match="nothing is labelled in empty"):
-        evaluate([Peer(HoughLinesPeer())], Material("empty", lambda: ()))
+        evaluate([Baseline(HoughLinesBaseline())], Material("empty", lambda: ()))
 
 
-def test_the_command_measures_frames_of_ones_own(tmp_path: Path) -> None:
+def test_the_command_evaluates_own_frames(tmp_path: Path) -> None:
     rows = list(range(300, 711, 10))
     cv2.imwrite(str(tmp_path / "road.png"), straight_road(1280, 720))
     lanes = [[int(640 + side * (row - 324)) if row > 340 else -2 for row in rows] for side in (-1, 1)]
@@ -202,6 +202,6 @@ def test_the_command_measures_frames_of_ones_own(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     figures = json.loads(path.read_text())
     assert figures["clips"] == {name: {} for name in figures["methods"]}
-    peer = figures["images"][PEERS[0].name][OVERALL]
-    assert (peer["boundaries"]["ego"]["right"], peer["boundaries"]["ego"]["missed"]) == (2, 0)
+    baseline = figures["images"][BASELINES[0].name][OVERALL]
+    assert (baseline["boundaries"]["ego"]["right"], baseline["boundaries"]["ego"]["missed"]) == (2, 0)
     assert (tmp_path / "made" / "report.html").is_file()

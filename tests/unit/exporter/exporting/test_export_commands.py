@@ -1,4 +1,4 @@
-"""The command `export`, given what it can't use, and the table that it prints."""
+"""The command `export`: invalid input, and the table that it prints."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from lanestream.engine import SHIPPED_REGRESSOR
 from lanestream.errors import CheckpointError, ExportError, ModelError
 from lanestream_exporter import export_commands
 from lanestream_exporter.alexnet import AlexNet, Shape
-from lanestream_exporter.exporting.classifier import ClassifierSubject
+from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.export import ExportReport
-from lanestream_exporter.exporting.frames import FrameSource
-from lanestream_exporter.exporting.proof import Boundaries, Measured
-from lanestream_exporter.exporting.regressor import RegressorSubject
+from lanestream_exporter.exporting.frames import ExportFrames
+from lanestream_exporter.exporting.proof import BoundaryComparison, ModelMeasurement
+from lanestream_exporter.exporting.regressor import ExportableRegressor
 from lanestream_exporter.regressor import LaneRegressor
 
 SMALL = Shape(64, 0.1, 16)
@@ -30,38 +30,38 @@ def called(*arguments: str | Path) -> Result:
 
 
 @pytest.mark.parametrize(
-    ("strip", "words"),
+    ("patch", "message"),
     [
-        ("width=30", "there is no 'width'; accepted: size, half_width"),
+        ("width=30", "unknown key 'width'; accepted: size, half_width"),
         ("half_width=wide", "half_width must be a number, not 'wide'"),
         ("size=0", "size must be above 0"),
         ("half_width=nan", "half_width must be above 0"),
         ("min_half_width=inf", "min_half_width must be above 0"),
     ],
 )
-def test_strips_that_can_not_be_are_refused(tmp_path: Path, strip: str, words: str) -> None:
-    result = called("any.pt", tmp_path / "out.onnx", "--classes", "false,lane", "--strip", strip)
+def test_invalid_patch_geometries_are_rejected(tmp_path: Path, patch: str, message: str) -> None:
+    result = called("any.pt", tmp_path / "out.onnx", "--classes", "false,lane", "--patch", patch)
     assert result.exit_code == 2
-    assert words in " ".join(result.output.split())
+    assert message in " ".join(result.output.split())
 
 
-def test_a_strip_names_what_is_unusual() -> None:
+def test_a_patch_geometry_names_only_what_differs_from_the_defaults() -> None:
     command = export_commands.export
-    with command.make_context("export", ["a.pt", "b.onnx", "--strip", "half_width=0.4, lean=0"]) as context:
-        assert context.params["strip"] == PatchGeometry(224, half_width=0.4, lean=0.0)
+    with command.make_context("export", ["a.pt", "b.onnx", "--patch", "half_width=0.4, lean=0"]) as context:
+        assert context.params["patch"] == PatchGeometry(224, half_width=0.4, lean=0.0)
 
 
-def test_classes_and_strips_go_together(tmp_path: Path) -> None:
+def test_classes_and_patch_geometry_must_be_given_together(tmp_path: Path) -> None:
     result = called("any.pt", tmp_path / "out.onnx", "--classes", "false,lane")
     assert result.exit_code == 2
-    assert "both --classes and --strip" in result.output
+    assert "both --classes and --patch" in result.output
 
 
-def test_a_folder_is_no_file_to_write(tmp_path: Path) -> None:
+def test_a_folder_as_output_is_rejected(tmp_path: Path) -> None:
     assert isinstance(called("any.pt", tmp_path).exception, ExportError)
 
 
-def test_what_is_no_checkpoint_is_told_before_any_work(tmp_path: Path) -> None:
+def test_an_invalid_checkpoint_fails_before_any_work(tmp_path: Path) -> None:
     path = tmp_path / "other.pt"
     torch.save({"weights": torch.zeros(3)}, path)
     result = called(path, tmp_path / "out.onnx")
@@ -69,54 +69,52 @@ def test_what_is_no_checkpoint_is_told_before_any_work(tmp_path: Path) -> None:
     assert not result.output
 
 
-def test_a_classifier_is_proved_as_it_is_served() -> None:
-    frames = FrameSource(None, rendered=4)
-    subject = ClassifierSubject(AlexNet(shape=SMALL), strip=PatchGeometry(SMALL.size))
-    served, shipped, alone = (
-        [bottoms(prepared) for prepared in export_commands._guided(subject, guide).check(frames).prepared]
-        for guide in (SHIPPED_REGRESSOR, None, Path("none"))
-    )
+def test_a_classifier_is_verified_with_the_regressor_that_it_is_served_with() -> None:
+    frames = ExportFrames(None, rendered=4)
+    network = ExportableClassifier(AlexNet(shape=SMALL), patch_geometry=PatchGeometry(SMALL.size))
+    networks = [export_commands._with_prior(network, path) for path in (SHIPPED_REGRESSOR, None, Path("none"))]
+    served, shipped, alone = ([bottoms(p) for p in each.validation_set(frames).prepared] for each in networks)
     assert served == shipped
     assert served != alone
-    assert alone == [bottoms(prepared) for prepared in subject.check(frames).prepared]
+    assert alone == [bottoms(prepared) for prepared in network.validation_set(frames).prepared]
 
 
 def bottoms(prepared: Prepared) -> list[float]:
-    """Where the candidates cross the bottom row."""
+    """Returns the columns where the candidates cross the bottom row."""
     return [round(float(candidate.curve.x(prepared.view.bottom)), 1) for candidate in prepared.candidates]
 
 
-def test_a_guide_is_for_classifiers(tmp_path: Path) -> None:
+def test_only_classifiers_take_a_regressor(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"can't read .*gone\.onnx"):
-        export_commands._guided(ClassifierSubject(AlexNet(shape=SMALL)), tmp_path / "gone.onnx")
-    with pytest.raises(UsageError, match="a regressor has no guide"):
-        export_commands._guided(RegressorSubject(LaneRegressor(SMALL)), SHIPPED_REGRESSOR)
+        export_commands._with_prior(ExportableClassifier(AlexNet(shape=SMALL)), tmp_path / "gone.onnx")
+    with pytest.raises(UsageError, match="--regressor is only for classifiers"):
+        export_commands._with_prior(ExportableRegressor(LaneRegressor(SMALL)), SHIPPED_REGRESSOR)
 
 
 def test_the_table_compares_size_accuracy_and_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [
-        Measured("checkpoint", {"accuracy": 0.95, "average_precision": 0.99}),
-        Measured("fp32", {"accuracy": 0.949, "average_precision": 0.99}, 1e-6, 2e-5, 12_000_000, 4.0),
-        Measured("int8", {"accuracy": 0.947, "average_precision": 0.98}, 1e-3, 5e-2, 3_000_000, 1.2),
+        ModelMeasurement("checkpoint", {"accuracy": 0.95, "average_precision": 0.99}),
+        ModelMeasurement("fp32", {"accuracy": 0.949, "average_precision": 0.99}, 1e-6, 2e-5, 12_000_000, 4.0),
+        ModelMeasurement("int8", {"accuracy": 0.947, "average_precision": 0.98}, 1e-3, 5e-2, 3_000_000, 1.2),
     ]
     with torch.device("meta"):
-        subject = ClassifierSubject(AlexNet(normalised=False))
-    report = ExportReport(subject, 20, 300, *rows, Boundaries(80, 1, 0.1, 2.5), "openvino")
+        network = ExportableClassifier(AlexNet(normalised=False))
+    report = ExportReport(network, 20, 300, *rows, BoundaryComparison(80, 1, 0.1, 2.5), "openvino")
     out = tmp_path / "out.onnx"
-    out.write_bytes(bytes(1234))  # the figures are written into the file after it has been measured
-    export_commands._tell(out, report, FrameSource(None))
-    told = capsys.readouterr().out
-    assert "300 inputs of 20 validation frames: rendered scenes" in told
-    assert "int8 against checkpoint: 0.30 points of accuracy lost" in told
-    assert "int8 against fp32: 0.20 points of accuracy lost" in told
-    assert "int8 against fp32, the same network: 0.30 of the time (openvino)" in told
-    assert "80 by PyTorch and by the file, 1 by one alone" in told
-    assert "1,234 bytes" in told
+    out.write_bytes(bytes(1234))  # the metrics are written into the file after it has been measured
+    export_commands._print_report(out, report, ExportFrames(None))
+    output = capsys.readouterr().out
+    assert "300 inputs of 20 validation frames: rendered scenes" in output
+    assert "int8 against checkpoint: 0.30 points of accuracy lost" in output
+    assert "int8 against fp32: 0.20 points of accuracy lost" in output
+    assert "int8 against fp32, the same network: 0.30 of the time (openvino)" in output
+    assert "80 found by both PyTorch and the file, 1 by only one" in output
+    assert "1,234 bytes" in output
     for cell in ("12.0 MB", "3.0 MB", "4.00 ms", "1.20 ms", "0.9470"):
-        assert cell in told
+        assert cell in output
 
 
-def test_frames_of_ones_own_prove_the_file_where_they_are_still_there(tmp_path: Path) -> None:
+def test_own_frames_verify_the_file_if_they_still_exist(tmp_path: Path) -> None:
     data = {"train": [{"path": str(tmp_path), "format": "auto"}], "validation": [], "validation_share": 0.25}
     found = export_commands._own_frames({"config": {"data": data}})
     assert found is not None

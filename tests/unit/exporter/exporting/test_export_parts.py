@@ -1,4 +1,4 @@
-"""The parts of an export: folding, truncation, calibration, normalisation, boundaries compared, files put in place."""
+"""The parts of an export: folding, truncation, calibration, normalization, comparing boundaries, publishing files."""
 
 from __future__ import annotations
 
@@ -18,12 +18,10 @@ from lanestream.road.results import Detection
 from lanestream.road.view import RoadView
 from lanestream_exporter.alexnet import AlexNet, normalise
 from lanestream_exporter.exporting import proof
-from lanestream_exporter.exporting.calibration import Calibration, calibrated
-from lanestream_exporter.exporting.compression import truncated
-from lanestream_exporter.exporting.graph import publish
-from lanestream_exporter.exporting.normalisation import contrast, imagenet
-from lanestream_exporter.exporting.proof import boundaries
-from lanestream_exporter.exporting.subject import Check
+from lanestream_exporter.exporting.compression import truncate_layers
+from lanestream_exporter.exporting.exportable import Calibration, ValidationSet, fit_calibration
+from lanestream_exporter.exporting.graph import contrast, imagenet, publish
+from lanestream_exporter.exporting.proof import compare_boundaries
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +33,7 @@ def patches() -> NDArray[np.uint8]:
 
 @pytest.fixture(scope="module")
 def network() -> AlexNet:
-    """A network whose normalisation layers have something to fold."""
+    """Returns a network with nontrivial batch normalization layers."""
     torch.manual_seed(0)
     made = AlexNet()
     for norm in made.norms.values():
@@ -50,7 +48,7 @@ def network() -> AlexNet:
 
 
 @torch.inference_mode()
-def test_folding_keeps_the_function_and_leaves_the_plain_topology(network: AlexNet, patches: NDArray[np.uint8]) -> None:
+def test_folding_keeps_the_function_and_removes_the_normalization(network: AlexNet, patches: NDArray[np.uint8]) -> None:
     plain = network.folded()
     x = normalise(torch.from_numpy(patches[:4]))
     torch.testing.assert_close(plain(x), network(x), rtol=1e-3, atol=1e-4)
@@ -73,21 +71,21 @@ def layers() -> nn.Sequential:
 
 
 @torch.inference_mode()
-def test_truncation_is_small_and_nearly_exact_on_what_it_saw(layers: nn.Sequential) -> None:
+def test_truncation_is_small_and_nearly_exact_on_its_training_inputs(layers: nn.Sequential) -> None:
     few = torch.randn(5, 300, generator=torch.Generator().manual_seed(2))
-    x = torch.randn(64, 5, generator=torch.Generator().manual_seed(3)) @ few  # in few directions, as roads are
-    small = truncated(layers, x, 0.9999)
+    x = torch.randn(64, 5, generator=torch.Generator().manual_seed(3)) @ few  # low-dimensional, as roads are
+    small = truncate_layers(layers, x, 0.9999)
     weights = [sum(p.numel() for p in net.parameters()) for net in (layers, small)]
     assert weights[1] < 0.5 * weights[0]
     assert (small(x) - layers(x)).abs().max().item() < 0.05 * layers(x).std().item()
 
 
 @torch.inference_mode()
-def test_what_passes_between_thin_layers_is_of_one_size(layers: nn.Sequential) -> None:
+def test_components_between_thin_layers_have_similar_magnitudes(layers: nn.Sequential) -> None:
     directions = torch.linalg.qr(torch.randn(300, 8, generator=torch.Generator().manual_seed(5))).Q
     sizes = torch.tensor([64.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.25, 0.1])
     x = (torch.randn(256, 8, generator=torch.Generator().manual_seed(6)) * sizes) @ directions.T
-    thin = truncated(layers, x, 0.9999)[0]
+    thin = truncate_layers(layers, x, 0.9999)[0]
     assert isinstance(thin, nn.Sequential)
     spread = thin[0](x).std(dim=0)
     assert len(spread) > 2
@@ -95,25 +93,25 @@ def test_what_passes_between_thin_layers_is_of_one_size(layers: nn.Sequential) -
 
 
 @torch.inference_mode()
-def test_truncation_leaves_what_it_would_not_make_smaller(layers: nn.Sequential) -> None:
+def test_truncation_keeps_layers_that_it_would_not_shrink(layers: nn.Sequential) -> None:
     x = torch.randn(400, 300, generator=torch.Generator().manual_seed(4))
     for energy in (1.0, 0.999999):
-        assert torch.equal(truncated(layers, x, energy)(x), layers(x))
+        assert torch.equal(truncate_layers(layers, x, energy)(x), layers(x))
 
 
 @torch.inference_mode()
-def test_brightness_and_contrast_of_a_patch_do_not_matter(patches: NDArray[np.uint8]) -> None:
+def test_brightness_and_contrast_of_a_patch_are_normalized_away(patches: NDArray[np.uint8]) -> None:
     dim = (patches[:2].astype(np.float32) * 0.5 + 20.0).astype(np.uint8)
     difference = normalise(torch.from_numpy(dim)) - normalise(torch.from_numpy(patches[:2]))
     assert difference.abs().mean().item() < 0.1
 
 
-def test_the_served_normalisation_is_that_of_training(patches: NDArray[np.uint8]) -> None:
+def test_the_served_normalization_matches_training(patches: NDArray[np.uint8]) -> None:
     images = torch.from_numpy(np.concatenate([patches[:6], patches[:2] // 50, np.full_like(patches[:1], 77)]))
     torch.testing.assert_close(contrast(images), normalise(images), rtol=1e-4, atol=1e-5)
 
 
-def test_imagenets_normalisation_is_that_of_torchvision() -> None:
+def test_the_imagenet_normalization_matches_torchvision() -> None:
     red = np.zeros((1, 2, 2, 3), np.uint8)
     red[..., 0] = 255
     made = imagenet(torch.from_numpy(red))
@@ -127,42 +125,42 @@ def test_calibration_finds_the_temperature_that_made_the_labels() -> None:
     margin = rng.normal(0.0, 3.0, 20_000)
     labels = (rng.random(20_000) < 1.0 / (1.0 + np.exp(-margin))).astype(np.int64)
     logits = np.stack([np.zeros(20_000), 2.5 * margin], axis=1).astype(np.float32)
-    found = calibrated(logits, labels)
+    found = fit_calibration(logits, labels)
     assert found.temperature == pytest.approx(2.5, rel=0.1)
     assert 0.3 < found.threshold < 0.6
 
 
-def test_labels_that_are_all_alike_calibrate_nothing() -> None:
-    assert calibrated(np.ones((9, 2), np.float32), np.ones(9, np.int64)) == Calibration(1.0, 0.5)
+def test_equal_labels_give_the_default_calibration() -> None:
+    assert fit_calibration(np.ones((9, 2), np.float32), np.ones(9, np.int64)) == Calibration(1.0, 0.5)
 
 
-def test_boundaries_of_two_answers_are_compared_in_columns() -> None:
+def test_boundaries_of_two_networks_are_compared_by_columns() -> None:
     view = RoadView(640, 360, 160.0)
     inputs = np.zeros((2, 224, 224, 3), np.uint8)
     prepared = Prepared(np.zeros((360, 640, 3), np.uint8), (lambda: inputs,), view, looks=(view,))
-    check = Check(2, (prepared, prepared), {})
+    validation = ValidationSet(2, (prepared, prepared), {})
     straight = [-0.3, -0.12, -0.05, 0.3, 0.12, 0.05, *[0.01] * 6, 0.9, 0.9, 0.0]
-    both = np.array([straight, straight], np.float32)  # straight and mirrored, which are alike here
+    both = np.array([straight, straight], np.float32)  # straight and mirrored views, which are equal here
     single = both.copy()
     single[0, 13] = single[1, 12] = 0.0
     same, other = (np.concatenate([both, part]) for part in (both, single))
-    found = boundaries(RegressionDetector(), check, same, other)
-    assert (found.both, found.alone) == (3, 1)
-    assert 0.0 < found.mean < found.largest  # what is fitted alone runs elsewhere than beside another boundary
-    alike = boundaries(RegressionDetector(), check, same, same)
-    assert (alike.both, alike.alone, alike.mean, alike.largest) == (4, 0, 0.0, 0.0)
+    found = compare_boundaries(RegressionDetector(), validation, same, other)
+    assert (found.matched, found.unmatched) == (3, 1)
+    assert 0.0 < found.mean < found.largest  # a boundary fitted alone differs from one fitted jointly
+    equal = compare_boundaries(RegressionDetector(), validation, same, same)
+    assert (equal.matched, equal.unmatched, equal.mean, equal.largest) == (4, 0, 0.0, 0.0)
 
 
-def test_the_columns_of_boundaries_that_both_found_are_compared() -> None:
-    def moved(by: float) -> list[Detection]:
+def test_only_close_boundaries_are_matched() -> None:
+    def shifted(by: float) -> list[Detection]:
         return [Detection(Curve(100.0, (320.0 + by, b, 0.0)), np.eye(3), 200.0, 350.0, 0.9) for b in (-1.0, 1.0)]
 
-    pairs = proof._paired(moved(0.0), moved(1.5), scale=0.5)
+    pairs = proof._match(shifted(0.0), shifted(1.5), scale=0.5)
     assert [gap.max() for gap in pairs] == pytest.approx([0.75, 0.75])
-    assert not proof._paired(moved(0.0), moved(40.0), scale=0.5)
+    assert not proof._match(shifted(0.0), shifted(40.0), scale=0.5)
 
 
-def test_a_file_that_can_not_be_written_is_told_and_nothing_is_left(tmp_path: Path) -> None:
+def test_a_failed_publish_raises_and_leaves_no_partial_file(tmp_path: Path) -> None:
     made = tmp_path / "made.onnx"
     made.write_bytes(b"model")
     (tmp_path / "taken").mkdir()

@@ -13,7 +13,8 @@ from lanestream.road.results import Candidate
 from lanestream.road.view import RoadView
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
-from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_labels, match
+from lanestream_exporter.evaluation.score import BoundaryCounts
 from lanestream_exporter.samples.patch_store import read_stores, write_store
 from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE, TruthRule, fitted_candidate
 
@@ -72,8 +73,8 @@ def test_beyond_the_labels_a_candidate_is_unknown_where_the_side_is_open(
     labels = frame(label(-1.1, position=-1), label(1.1, position=1), coverage=coverage)
     assert TruthRule().judge([candidate(-2.5), candidate(2.5)], labels, VIEW).tolist() == verdicts
     for b, verdict in zip((-2.5, 2.5), verdicts, strict=True):
-        tally = Tally()
-        count(tally, [found(b)], labels.lanes, labels)
+        tally = BoundaryCounts()
+        tally.add(match([found(b)], labels.lanes, labels))
         assert tally.wrong == (verdict == FALSE)
 
 
@@ -95,33 +96,33 @@ def test_a_label_becomes_the_candidate_that_follows_it() -> None:
     np.testing.assert_allclose(fitted.curve.x(rows), bent.x(rows), atol=0.01)
 
 
-def found(b: float, v: float = 640.0, top: float = 342.0, position: int = -1) -> Found:
-    return Found(curve(b, v), top, 719.0, position)
+def found(b: float, v: float = 640.0, top: float = 342.0, position: int = -1) -> ReportedBoundary:
+    return ReportedBoundary(curve(b, v), top, 719.0, position)
 
 
 def test_boundaries_are_matched_one_to_one() -> None:
-    tally = Tally()
-    count(tally, [found(-1.1), found(-1.1, 635.0)], [label(-1.1)], frame(label(-1.1), label(1.1)))
+    tally = BoundaryCounts()
+    tally.add(match([found(-1.1), found(-1.1, 635.0)], [label(-1.1)], frame(label(-1.1), label(1.1))))
     assert (tally.right, tally.wrong, tally.missed) == (1, 1, 0)  # the second repeats the outermost label
-    tally = Tally()
-    count(tally, [found(-1.1), found(-3.3)], [label(-1.1)], frame(label(-1.1), label(1.1)))
+    tally = BoundaryCounts()
+    tally.add(match([found(-1.1), found(-3.3)], [label(-1.1)], frame(label(-1.1), label(1.1))))
     assert (tally.right, tally.wrong, tally.missed) == (1, 0, 0)  # the second lies beyond it: nobody knows
-    tally = Tally()
-    count(tally, [found(-1.1), found(-1.1, 645.0)], [label(-1.1)], frame(label(-1.1), coverage=WHOLE))
+    tally = BoundaryCounts()
+    tally.add(match([found(-1.1), found(-1.1, 645.0)], [label(-1.1)], frame(label(-1.1), coverage=WHOLE)))
     assert (tally.right, tally.wrong, tally.missed) == (1, 1, 0)
     assert tally.errors == pytest.approx([0.0], abs=1e-9)
 
 
 def test_far_off_or_short_ones_are_wrong_and_the_label_is_missed() -> None:
     for wrong in (found(-1.1, 700.0), found(-1.1, top=600.0)):
-        tally = Tally()
-        count(tally, [wrong], [label(-1.1)], frame(label(-1.1), coverage=WHOLE))
+        tally = BoundaryCounts()
+        tally.add(match([wrong], [label(-1.1)], frame(label(-1.1), coverage=WHOLE)))
         assert (tally.right, tally.wrong, tally.missed) == (0, 1, 1)
 
 
 def test_errors_are_told_at_640_pixels_of_width() -> None:
-    tally = Tally()
-    count(tally, [found(0.0, 650.0)], [label(0.0)], frame(label(0.0), coverage=WHOLE))
+    tally = BoundaryCounts()
+    tally.add(match([found(0.0, 650.0)], [label(0.0)], frame(label(0.0), coverage=WHOLE)))
     assert tally.mean_error == pytest.approx(5.0)
 
 

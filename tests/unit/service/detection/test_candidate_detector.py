@@ -14,7 +14,8 @@ from lanestream.road.curve import Curve
 from lanestream.road.results import Candidate
 from lanestream.road.view import RoadView
 from lanestream_exporter.datasets.labels import WHOLE
-from lanestream_exporter.evaluation.boundaries import Found, Tally, count, ego_labels
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_labels, match
+from lanestream_exporter.evaluation.score import BoundaryCounts
 from lanestream_exporter.samples.patches import TRUE, TruthRule, fitted_candidate
 from lanestream_exporter.scenes import Drive, RenderedFrame, render_still, sample_clip
 
@@ -50,9 +51,9 @@ def test_an_oracle_network_gives_exact_boundaries(width: int, height: int) -> No
     assert prepared.inputs.shape == (len(prepared.candidates), 112, 112, 3)
     verdicts = TruthRule(near=16.0).judge(prepared.candidates, still.labels, prepared.view)
     outputs = np.stack([verdicts != TRUE, verdicts == TRUE], axis=1).astype(np.float32)
-    found = [Found(d.curve, d.top, d.bottom, 0) for d in detector.finish(prepared, outputs).detections]
-    tally = Tally()
-    count(tally, found, ego_labels(still.labels), still.labels)
+    found = [ReportedBoundary(d.curve, d.top, d.bottom, 0) for d in detector.finish(prepared, outputs).detections]
+    tally = BoundaryCounts()
+    tally.add(match(found, ego_labels(still.labels), still.labels))
     assert tally.missed == 0
     assert tally.mean_error < 2.5
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 
-@pytest.mark.parametrize("module", ["lanestream.engine", "lanestream.doctor", "lanestream_exporter.exporting.versions"])
+@pytest.mark.parametrize("module", ["lanestream.engine", "lanestream.doctor", "lanestream_exporter.exporting.graph"])
 def test_onnxruntime_is_stopped_from_telling_before_it_is_imported(module: str, tmp_path: Path) -> None:
     # In continuous integration onnxruntime is quiet by itself.
     kept = {name: value for name, value in os.environ.items() if name not in {"CI", "ORT_DISABLE_TELEMETRY"}}
