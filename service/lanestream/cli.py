@@ -48,7 +48,9 @@ _EVALUATION: Final = "lanestream_exporter.evaluation_commands"
 _MOUNTS: Final[Mapping[str, Mount]] = {
     "detect": Mount(_CLIENT, "detect", "video", "Find lanes in images."),
     "stream": Mount(_CLIENT, "stream", "video", "Follow the lanes of one camera."),
-    "doctor": Mount("lanestream.doctor", "doctor", "service,cpu", "Tell what networks run on here."),
+    "doctor": Mount(
+        "lanestream.doctor", "doctor", "service,cpu", "Show what the networks run on and how fast they are."
+    ),
     "scene": Mount(_SCENES, "scene", "video", "Render a clip of a road, with exact labels."),
     "data": Mount(_DATA, "data", "export", "Look after labelled frames."),
     "train": Mount(_TRAINING, "train", "train,service,cpu", "Train a network."),

@@ -12,10 +12,10 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from lanestream.errors import ModelError, ProviderError, one_line
+from lanestream.host import processors
 from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import ModelInfo, parse_info, require_file
 from lanestream.inference.providers import NAMES, OnnxProvider, preload_gpu_libraries, verify
-from lanestream.processors import processors
 from lanestream.runtime import DEFAULT_OPTIONS, RuntimeOptions
 
 # The CPU takes any size at the same price, so that nothing is padded there, and gains nothing beyond some 8 at once.

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.errors import ModelError, ProviderError, one_line
+from lanestream.host import processors
 from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import METADATA_KEY, ModelInfo, parse_info, require_file
-from lanestream.processors import processors
 from lanestream.runtime import DEFAULT_OPTIONS, RuntimeOptions
 
 # A new batch size costs OpenVINO a few milliseconds once, and no size is dearer than another.

@@ -12,7 +12,7 @@ from typing import Final, Literal
 import onnxruntime
 
 from lanestream.errors import ProviderError
-from lanestream.processors import instructions
+from lanestream.host import instruction_sets
 from lanestream.runtime import Provider
 
 # The providers of onnxruntime, and all that a network can be loaded for.
@@ -60,7 +60,7 @@ def offered() -> Offer:
     return Offer(
         onnxruntime=frozenset(onnxruntime.get_available_providers()),
         openvino=find_spec("openvino") is not None,
-        amx="amx_int8" in instructions(),
+        amx="amx_int8" in instruction_sets(),
     )
 
 

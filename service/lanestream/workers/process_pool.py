@@ -12,8 +12,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import LanestreamError, WorkerLostError
-from lanestream.memory import memory_limit
-from lanestream.processors import processors
+from lanestream.host import memory_limit, processors
 from lanestream.session import SessionState
 from lanestream.tracking import LaneTracker
 from lanestream.workers.capabilities import Capabilities
