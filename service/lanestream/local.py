@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from lanestream.detection.features import WORKING_WIDTH
 from lanestream.engine import load_engine, resolve_regressor
-from lanestream.images.decoding import MOST_PIXELS, ImageLimits, Picture, decode_reduced
+from lanestream.images.decoding import MOST_PIXELS, DecodedImage, ImageLimits, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class LocalCamera:
         Raises ImageError where the file can't be decoded; the session is then as it was before.
         """
         started = time.perf_counter()
-        picture = decode_reduced(image, _LIMITS, WORKING_WIDTH) if isinstance(image, bytes) else Picture(image)
+        picture = decode_reduced(image, _LIMITS, WORKING_WIDTH) if isinstance(image, bytes) else DecodedImage(image)
         decoded = time.perf_counter()
         result = self._engine.process(self._session, picture.image, timestamp)
         total = 1e3 * (time.perf_counter() - started)

@@ -26,7 +26,7 @@ from lanestream.road.view import Scaling
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lanestream.images.decoding import Picture
+    from lanestream.images.decoding import DecodedImage
     from lanestream.road.curve import FloatArray
     from lanestream.road.results import EgoLane, FrameResult, LaneBoundary
 
@@ -48,7 +48,7 @@ class ProcessedFrame:
     result: FrameResult
 
     @classmethod
-    def of(cls, picture: Picture, result: FrameResult, timing_ms: dict[str, float]) -> ProcessedFrame:
+    def of(cls, picture: DecodedImage, result: FrameResult, timing_ms: dict[str, float]) -> ProcessedFrame:
         """From the `result` in pixels of the decoded image."""
         scaling = picture.scaling
         lanes = tuple(_in_image(lane, scaling) for lane in result.lanes)

@@ -1,4 +1,4 @@
-"""What users can say about where networks run. Light: no runtime is imported here."""
+"""The options for running networks. Cheap to import: it imports no inference runtime."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ PROVIDERS: Final[tuple[Provider, ...]] = get_args(Provider)
 
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """How networks run: `threads` of one run on the CPU, one for each processor that may be used where None.
+    """How networks run: `threads` per run on the CPU, or one per available processor if None.
 
-    `engine_cache` is the folder where TensorRT keeps the engines that it built; None builds them at each start.
+    `engine_cache` is the folder where TensorRT keeps the engines that it built; if None, it builds them at each start.
     """
 
     threads: int | None = None

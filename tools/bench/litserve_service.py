@@ -13,7 +13,7 @@ import numpy as np
 from lanestream.detection import Question, Steps, in_one
 from lanestream.detection.features import WORKING_WIDTH
 from lanestream.engine import load_engine
-from lanestream.images.decoding import ImageLimits, Picture, decode_reduced
+from lanestream.images.decoding import DecodedImage, ImageLimits, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.road.results import FrameResult
 from lanestream.runtime import Provider
@@ -34,16 +34,16 @@ class LitServeLaneApi(litserve.LitAPI):  # type: ignore[misc]
         """Loads and warms up the networks, in the worker process."""
         self._engine = load_engine(provider=self._provider)
 
-    def decode_request(self, request: litserve.Request) -> Picture:
+    def decode_request(self, request: litserve.Request) -> DecodedImage:
         """Decodes the image in the form field `image`."""
         return decode_reduced(request["image"].file.read(), ImageLimits(), WORKING_WIDTH)
 
-    def predict(self, pictures: Sequence[Picture]) -> list[ProcessedFrame]:
+    def predict(self, images: Sequence[DecodedImage]) -> list[ProcessedFrame]:
         """Finds the lanes in a batch of images."""
-        frames = [self._engine.open_session().follow(picture.image, 0.0) for picture in pictures]
+        frames = [self._engine.open_session().follow(image.image, 0.0) for image in images]
         return [
-            ProcessedFrame.of(picture, result, _NO_TIMING)
-            for picture, result in zip(pictures, run_batched(frames), strict=True)
+            ProcessedFrame.of(image, result, _NO_TIMING)
+            for image, result in zip(images, run_batched(frames), strict=True)
         ]
 
     def encode_response(self, output: ProcessedFrame) -> dict[str, Any]:
