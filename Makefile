@@ -1,6 +1,6 @@
-# Each target does its own set-up: on a fresh machine `make demo` and `make test` need only Python 3.11 or later.
+# Every target sets up what it needs: on a fresh machine `make demo` and `make test` need only Python 3.11 or later.
 
-# The first Python that runs and is new enough: a version manager may have names of versions that it does not have.
+# The first Python that runs and is new enough. (A version manager may define names for versions that are not installed.)
 NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))'
 ifndef PYTHON
 PYTHON := $(shell for python in python3.13 python3.12 python3.11 python3; do \
@@ -12,13 +12,13 @@ BIN := $(VENV)/bin
 VIDEO ?=
 ARGS ?=
 
-# Docker, or podman where there is no docker; the image's variant is cpu or gpu.
+# Docker, or podman if docker is missing. The image's variant is cpu or gpu.
 ENGINE ?= $(if $(shell command -v docker),docker,podman)
 VARIANT ?= cpu
 VERSION = $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' service/lanestream/__init__.py)
 REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 
-# What an environment was last set up for; pyproject.toml is what it depends on.
+# Marks what the environment was set up for. It is set up again when pyproject.toml changes.
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
@@ -43,7 +43,7 @@ lint: $(DEV_READY)
 
 MODELS := service/lanestream/models
 
-# Networks like the shipped ones, into out/: hours of a CPU's work, which goes on where it was stopped.
+# Trains networks like the shipped ones and writes them to out/. Takes hours on a CPU; continues after an interruption.
 models: $(DEV_READY)
 	mkdir -p out
 	$(BIN)/lanestream train regressor --run runs/regressor
@@ -59,23 +59,24 @@ models: $(DEV_READY)
 evaluate: $(DEV_READY)
 	$(BIN)/lanestream evaluate --split test --model $(MODELS)/classifier.onnx --model $(MODELS)/regressor.onnx \
 	  --out out --json out/evaluation.json
-	$(BIN)/python tools/figures.py out/evaluation.json
+	$(BIN)/python tools/evaluation_tables.py out/evaluation.json
 
 proposals: $(DEV_READY)
 	$(BIN)/python tools/proposals.py --split test --json out/proposals.json
 
+# Compares with LitServe, too, if it is installed: .venv/bin/pip install -e '.[bench-litserve]'
 bench: $(DEV_READY)
 	PYTHONPATH=tools $(BIN)/python -m bench $(ARGS)
 
 asyncapi: $(DEV_READY)
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml
 
-# Needs npm: the schema of AsyncAPI documents is published there alone.
+# Needs npm: the schema of AsyncAPI documents is published only there.
 asyncapi-check: $(DEV_READY)
 	npm install --silent --no-audit --no-fund --prefix out/asyncapi @asyncapi/specs@6
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml out/asyncapi/node_modules/@asyncapi/specs/schemas/3.0.0.json
 
-# Each for so many seconds; atheris builds on CPython 3.11 to 3.13.
+# Seconds per target. atheris builds on CPython 3.11 to 3.13.
 FUZZ_S ?= 600
 
 SOAK_MINUTES := 30
@@ -91,7 +92,7 @@ fuzz: $(DEV_READY)
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
 
-# Podman's own image format has no place for a health check.
+# Podman's own image format can't store a health check.
 image:
 	$(ENGINE) build $(if $(findstring podman,$(ENGINE)),--format docker) -f docker/Dockerfile --target $(VARIANT) \
 	  --build-arg VERSION=$(VERSION) --build-arg REVISION=$(REVISION) -t lanestream:$(VARIANT) .
@@ -104,8 +105,8 @@ COMPOSE = $(ENGINE) compose -f docker/compose.yaml --profile $(VARIANT)
 up: image
 	docker/make-secrets $(ENGINE) run --rm lanestream:$(VARIANT)
 	$(COMPOSE) up --detach --wait
-	@echo 'the service: http://127.0.0.1:8000, its key in docker/secrets/local_key'
-	@echo 'its dashboard: http://127.0.0.1:3000, user admin, password in docker/secrets/grafana_password'
+	@echo 'service: http://127.0.0.1:8000, key in docker/secrets/local_key'
+	@echo 'dashboard: http://127.0.0.1:3000, user admin, password in docker/secrets/grafana_password'
 
 down:
 	$(COMPOSE) down
@@ -115,7 +116,7 @@ clean:
 
 $(VENV)/bin/python:
 	@"$(PYTHON)" $(NEW_ENOUGH) 2>/dev/null || \
-	  { echo "error: Python 3.11 or later is needed$(if $(PYTHON),$(comma) $(PYTHON) is none) (set PYTHON=...)" >&2; exit 1; }
+	  { echo "error: Python 3.11 or later is needed$(if $(PYTHON),$(comma) and $(PYTHON) is older or can't be run) (set PYTHON=...)" >&2; exit 1; }
 	"$(PYTHON)" -m venv $(VENV) || { echo "error: no venv module (on Debian: apt install python3-venv)" >&2; exit 1; }
 
 $(RUN_READY): pyproject.toml | $(VENV)/bin/python

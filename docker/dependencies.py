@@ -1,6 +1,6 @@
-"""Fills the image's environment: `dependencies.py ENVIRONMENT EXTRA...`, beside the product's pyproject.toml.
+"""Fills the image's environment: `dependencies.py ENVIRONMENT EXTRA...`, next to the product's pyproject.toml.
 
-Installs what the product and its extras require, and takes out what the service never imports.
+Installs the requirements of the product and its extras, and removes what the service never imports.
 """
 
 import shutil
@@ -9,17 +9,17 @@ import sys
 import tomllib
 from pathlib import Path
 
-# filterpy requires matplotlib, for plots that nobody sees here; the others came with it alone.
+# filterpy requires matplotlib, for plots that the service does not use; only matplotlib requires the others.
 UNUSED_PACKAGES = (
     *("matplotlib", "contourpy", "cycler", "fonttools"),
     *("kiwisolver", "pillow", "pyparsing", "python-dateutil"),
 )
-# Packages bring their tests, and OpenVINO what runs on Intel's GPUs and NPUs, which a container is not given.
+# Packages contain their tests, and OpenVINO has plugins for Intel's GPUs and NPUs, which a container has no access to.
 UNUSED_FILES = ("**/tests", "openvino/libs/libopenvino_intel_[gn]pu_plugin.so")
 
 
 def requirements(project: Path, extras: list[str]) -> list[str]:
-    """What the product requires with these extras. Raises KeyError where it has no such extra."""
+    """Returns the product's requirements with these extras. Raises KeyError for an unknown extra."""
     table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
     return [*table["dependencies"], *(line for extra in extras for line in table["optional-dependencies"][extra])]
 
@@ -34,7 +34,7 @@ def prune(packages: Path) -> None:
 
 
 def main(environment: Path, extras: list[str]) -> None:
-    """Installs, and takes out."""
+    """Installs the requirements and removes what is not used."""
     pip = [sys.executable, "-m", "pip", "--python", environment / "bin/python"]
     subprocess.run([*pip, "install", *requirements(Path("pyproject.toml"), extras)], check=True)
     subprocess.run([*pip, "uninstall", "--yes", *UNUSED_PACKAGES], check=True)

@@ -1,6 +1,6 @@
-"""The image's health check: ends with 0 where the service beside it is ready for frames, else says why not.
+"""The image's health check: exits with 0 if the service in the same container is ready for frames, else says why not.
 
-It runs every few seconds, so it needs the standard library alone.
+It runs every few seconds, so it imports only the standard library.
 """
 
 import os
@@ -11,21 +11,21 @@ from urllib.error import HTTPError
 from urllib.request import ProxyHandler, build_opener
 
 TIMEOUT_S = 4.0
-# An address that stands for all of them is listened on, not called.
+# The service may listen on all addresses; the check connects to the loopback address.
 LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104
 
 
 def readiness_url(environment: Mapping[str, str]) -> str:
-    """Where a service with the settings of this `environment` tells whether it is ready."""
+    """Returns the readiness URL of a service with the settings in `environment`."""
     host = environment.get("LANESTREAM_HOST") or "127.0.0.1"
     host = LOOPBACK.get(host, host)
     return f"http://{f'[{host}]' if ':' in host else host}:{environment.get('LANESTREAM_PORT') or '8000'}/readyz"
 
 
 def problem(url: str) -> str | None:
-    """Why the service at `url` is not ready; None where it is."""
+    """Returns why the service at `url` is not ready, or None if it is."""
     try:
-        # A proxy that the container may be given is for the outside.
+        # The container may have a proxy setting, which is for other hosts only.
         with build_opener(ProxyHandler({})).open(url, timeout=TIMEOUT_S):
             return None
     except HTTPError as error:

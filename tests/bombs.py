@@ -1,6 +1,6 @@
-"""Small image files that ask for a lot: of memory, of time, or to be taken for another image than the one checked.
+"""Small image files that would cost much memory or time, or that hide another image than the one that is checked.
 
-python tests/bombs.py     prints what each of them costs
+python tests/bombs.py     prints the cost of each
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ def png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def png(width: int, height: int, pixels: bytes | None = None, extra: bytes = b"", colours: int = 2) -> bytes:
-    """A black PNG in RGB, with the compressed data `pixels` in place of its own and `extra` chunks before them."""
-    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colours, 0, 0, 0))
+def png(width: int, height: int, pixels: bytes | None = None, extra: bytes = b"", colors: int = 2) -> bytes:
+    """A black RGB PNG with `extra` chunks before its pixels; `pixels` replaces its compressed data."""
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colors, 0, 0, 0))
     if pixels is None:
         pixels = zlib.compress(bytes(height * (1 + 3 * width)), 9)
     return PNG_MAGIC + header + extra + png_chunk(b"IDAT", pixels) + png_chunk(b"IEND", b"")
 
 
 def with_checksums(data: bytes) -> bytes:
-    """A PNG with the right checksum after every chunk, so that decoders look further; other data as they are."""
+    """A PNG with the right checksum after every chunk, so that decoders read on; other data unchanged."""
     fixed, at = bytearray(data), len(PNG_MAGIC)
     while data.startswith(PNG_MAGIC) and at + 12 <= len(data):
         end = at + 12 + int.from_bytes(data[at : at + 4], "big")
@@ -47,7 +47,7 @@ def with_checksums(data: bytes) -> bytes:
 
 
 def zeros(size: int) -> bytes:
-    """As many zeros as `size`, a whole number of MB, compressed a thousandfold, without an end."""
+    """`size` zeros (a whole number of MB), compressed a thousandfold, without the end of the stream."""
     packer = zlib.compressobj(9)
     head = packer.compress(b"") + packer.flush(zlib.Z_FULL_FLUSH)
     megabyte = packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_FULL_FLUSH)
@@ -55,12 +55,12 @@ def zeros(size: int) -> bytes:
 
 
 def huge_png() -> bytes:
-    """The usual one: 140 KB of grey that decode to 144 megapixels, 430 MB of BGR."""
-    return png(12_000, 12_000, zeros(12_000 * 12_001), colours=0)
+    """The classic decompression bomb: 140 KB of gray that decode to 144 megapixels, 430 MB of BGR."""
+    return png(12_000, 12_000, zeros(12_000 * 12_001), colors=0)
 
 
 def apng(first: tuple[int, int], frames: int) -> bytes:
-    """An animated PNG of 320 x 180 whose first frame says that it is of another size."""
+    """An animated PNG of 320 x 180 whose first frame claims another size."""
 
     def control(seq: int, width: int, height: int) -> bytes:
         return png_chunk(b"fcTL", struct.pack(">IIIIIHHBB", seq, width, height, 0, 0, 1, 10, 0, 0))
@@ -76,7 +76,7 @@ def apng(first: tuple[int, int], frames: int) -> bytes:
 
 
 def resized_jpeg(width: int, height: int) -> bytes:
-    """A JPEG of 320 x 180 that says that it is of another size."""
+    """A JPEG of 320 x 180 whose header claims another size."""
     data = fakes.image_file()
     at = data.index(b"\xff\xc0") + 5
     return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
@@ -87,7 +87,7 @@ def jpeg_segment(marker: int, data: bytes) -> bytes:
 
 
 def jpeg_behind_a_marker() -> bytes:
-    """A huge JPEG behind the marker TEM, which has no length: whoever believes that it has sees the small one after."""
+    """A huge JPEG behind the marker TEM, which has no length: readers that expect one see the small JPEG after it."""
     hidden = resized_jpeg(8000, 8000)[2:]
     return b"\xff\xd8" + jpeg_segment(0x01, hidden) + fakes.image_file()[2:]
 
@@ -108,16 +108,16 @@ def webp_chunk(kind: bytes, data: bytes) -> bytes:
     return kind + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
 
 
-def webp(canvas: tuple[int, int], image: bytes, *, animated: bool = False) -> bytes:
-    """An extended WebP that says how large its canvas is, around the image of the WebP file `image`."""
+def webp(size: tuple[int, int], image: bytes, *, animated: bool = False) -> bytes:
+    """An extended WebP that claims `size` and contains the image of the WebP file `image`."""
 
-    def three(number: int) -> bytes:
+    def int24(number: int) -> bytes:
         return number.to_bytes(3, "little")
 
-    width, height = canvas
-    body = webp_chunk(b"VP8X", bytes([2 if animated else 0, 0, 0, 0]) + three(width - 1) + three(height - 1))
+    width, height = size
+    body = webp_chunk(b"VP8X", bytes([2 if animated else 0, 0, 0, 0]) + int24(width - 1) + int24(height - 1))
     if animated:
-        frame = bytes(6) + three(width - 1) + three(height - 1) + three(100) + bytes(1) + image[12:]
+        frame = bytes(6) + int24(width - 1) + int24(height - 1) + int24(100) + bytes(1) + image[12:]
         body += webp_chunk(b"ANIM", bytes(6)) + webp_chunk(b"ANMF", frame)
     else:
         body += image[12:]
@@ -128,7 +128,7 @@ def huge_webp() -> bytes:
     return fakes.image_file(".webp", 5000, 4000, 9)
 
 
-# What each comes to: a part of the message that refuses it, or nothing where it is an ordinary image with ballast.
+# Each bomb with a part of the error message, or with an empty one if it is an ordinary image with ballast.
 BOMBS: Final[Mapping[str, tuple[Callable[[], bytes], str]]] = {
     "png: huge": (huge_png, "12000 x 12000, 144,000,000 pixels"),
     "png: far more data than pixels": (lambda: png(320, 180, zeros(1100 << 20)), "far more data than pixels"),
@@ -153,20 +153,20 @@ BOMBS: Final[Mapping[str, tuple[Callable[[], bytes], str]]] = {
         "2,000 segments",
     ),
     "webp: huge": (huge_webp, "20,000,000 pixels"),
-    "webp: huge canvas": (lambda: webp((16_000, 16_000), fakes.image_file(".webp")), "256,000,000 pixels"),
-    "webp: small canvas, huge image": (lambda: webp((320, 180), huge_webp()), "is corrupt"),
+    "webp: huge size": (lambda: webp((16_000, 16_000), fakes.image_file(".webp")), "256,000,000 pixels"),
+    "webp: small header, huge image": (lambda: webp((320, 180), huge_webp()), "is corrupt"),
     "webp: small animation, huge frame": (lambda: webp((320, 180), huge_webp(), animated=True), "is corrupt"),
 }
 
 
 def peak_mb() -> float:
-    """The most memory that this process ever had, in MB."""
+    """Returns the peak memory of this process in MB."""
     (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
     return int(line.split()[1]) / 1024
 
 
 def cost(data: bytes) -> tuple[float, float, str]:
-    """Milliseconds, more MB at the peak and the outcome of decoding `data`."""
+    """Returns the milliseconds, the MB added to the peak memory and the outcome of decoding `data`."""
     before, started = peak_mb(), time.perf_counter()
     try:
         outcome = f"image of {decode(data, ImageLimits()).shape}"
@@ -176,7 +176,7 @@ def cost(data: bytes) -> tuple[float, float, str]:
 
 
 def main() -> None:
-    """Prints the costs, each measured in a process of its own after an ordinary image of the kind."""
+    """Prints the costs, each measured in a process of its own after ordinary images of all formats."""
     for name, (make, _) in BOMBS.items():
         data = make()
         if os.fork():
@@ -184,8 +184,8 @@ def main() -> None:
             continue
         for kind in (".jpg", ".png", ".webp"):
             decode(fakes.image_file(kind), ImageLimits())
-        spent, more, outcome = cost(data)
-        print(f"{name:36}{len(data):>11,} B {spent:8.2f} ms {more:7.1f} MB  {outcome}", flush=True)
+        milliseconds, added, outcome = cost(data)
+        print(f"{name:36}{len(data):>11,} B {milliseconds:8.2f} ms {added:7.1f} MB  {outcome}", flush=True)
         os._exit(0)
 
 

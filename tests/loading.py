@@ -1,4 +1,4 @@
-"""Engines that worker processes load, or fail to."""
+"""Functions that worker processes call to load an engine; most of them fail."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from lanestream.engine import Engine
 from lanestream.errors import ModelError
 
 
-class Deadly(fakes.FakeNetwork):
-    """Ends its process at once."""
+class KillingNetwork(fakes.FakeNetwork):
+    """Kills its process in the first run."""
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -22,7 +22,7 @@ class Deadly(fakes.FakeNetwork):
 
 
 def deadly() -> Engine:
-    return fakes.engine(Deadly())
+    return fakes.engine(KillingNetwork())
 
 
 def missing() -> Engine:
@@ -30,7 +30,7 @@ def missing() -> Engine:
 
 
 def broken() -> Engine:
-    raise OSError("no such luck")
+    raise OSError("the disk is broken")
 
 
 def silent() -> Engine:

@@ -1,4 +1,4 @@
-"""A real Redis on a free port, for those who have `redis-server`."""
+"""A real Redis on a free port. It needs `redis-server`."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import pytest
 
 @contextmanager
 def redis_server(folder: Path) -> Iterator[str]:
-    """The URL of a Redis that keeps nothing on disk."""
-    program = shutil.which("redis-server")
-    if program is None:
+    """Starts a Redis that keeps nothing on disk and yields its URL."""
+    executable = shutil.which("redis-server")
+    if executable is None:
         pytest.fail("redis-server is not installed (on Debian: apt install redis-server)")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     options = {"--port": str(port), "--bind": "127.0.0.1", "--save": "", "--appendonly": "no", "--dir": str(folder)}
-    command = [program, *(part for option in options.items() for part in option)]
+    command = [executable, *(part for option in options.items() for part in option)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
         try:
             _wait_for(port)
@@ -33,11 +33,11 @@ def redis_server(folder: Path) -> Iterator[str]:
 
 
 def _wait_for(port: int) -> None:
-    ends = time.monotonic() + fakes.WAIT_S
-    while time.monotonic() < ends:
-        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as there:
-            there.sendall(b"PING\r\n")
-            if there.recv(16).startswith(b"+PONG"):
+    end = time.monotonic() + fakes.WAIT_S
+    while time.monotonic() < end:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as connection:
+            connection.sendall(b"PING\r\n")
+            if connection.recv(16).startswith(b"+PONG"):
                 return
         time.sleep(0.01)
     pytest.fail("redis-server did not start")

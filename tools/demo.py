@@ -1,7 +1,7 @@
-"""`make demo`: a clip through a service of its own, as a user would send it; results under out/.
+"""`make demo`: streams a video to a service that it starts, as a user would, and writes the results to out/.
 
-Without a video it renders one. The service runs on a free port, is waited for until it is ready, and is stopped
-whatever happens.
+Without a video it renders one. The service runs on a free port and is always stopped at the end. Other tools use the
+functions that start and stop it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ READY_S = 60.0
 
 
 def main(video: str | None) -> int:
-    """Runs the demo; the exit code is that of the stream."""
+    """Runs the demo and returns the exit code of the stream."""
     OUT.mkdir(exist_ok=True)
     if video is None:
         video = str(OUT / "scene.mp4")
@@ -43,14 +43,14 @@ def main(video: str | None) -> int:
 
 @contextmanager
 def service(log_path: Path, *arguments: str | Path) -> Iterator[str]:
-    """A service on a free port, by its URL, started with further `arguments`; its log goes to `log_path`."""
+    """Starts a service on a free port with further `arguments` and yields its URL; its log goes to `log_path`."""
     with service_process(log_path, *arguments) as (_, url):
         yield url
 
 
 @contextmanager
 def service_process(log_path: Path, *arguments: str | Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """The same, with its process."""
+    """Like `service`, but yields the process as well."""
     port = free_port()
     url = f"http://127.0.0.1:{port}"
     with log_path.open("w") as log:
@@ -63,7 +63,7 @@ def service_process(log_path: Path, *arguments: str | Path) -> Iterator[tuple[su
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """Asks the service to end, and ends it where it does not."""
+    """Terminates the service, and kills it if that takes too long."""
     process.send_signal(signal.SIGTERM)
     try:
         process.wait(timeout=30)
@@ -72,7 +72,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def wait_until_ready(process: subprocess.Popen[bytes], url: str, log_path: Path) -> None:
-    """Returns when the network is warm; exits with what the service said where it does not come up."""
+    """Returns when the networks are warm. Exits with the service's log if it does not get ready."""
     end = time.monotonic() + READY_S
     while time.monotonic() < end and process.poll() is None:
         try:
@@ -81,11 +81,11 @@ def wait_until_ready(process: subprocess.Popen[bytes], url: str, log_path: Path)
         except httpx.TransportError:
             pass
         time.sleep(0.1)
-    sys.exit(f"error: the service did not come up:\n{log_path.read_text()}")
+    sys.exit(f"error: the service did not get ready:\n{log_path.read_text()}")
 
 
 def free_port() -> int:
-    """A port that nobody listens on just now."""
+    """Returns a port on which nothing listens at the moment."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return int(probe.getsockname()[1])
 

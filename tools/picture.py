@@ -1,4 +1,4 @@
-"""Draws the README's picture: the lanes of a rendered road, after two seconds of tracking."""
+"""Draws the image for the README: the lanes of a rendered road, after two seconds of tracking."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEED, WIDTH, HEIGHT, FRAMES, FPS = 24, 1280, 720, 50, 25.0
 
 
 def main(out: Path) -> None:
-    """Writes the picture to `out`."""
+    """Writes the image to `out`."""
     drive = Drive("highway", lane_change=True, fair=True)
     clip = sample_clip(np.random.default_rng(SEED), WIDTH, HEIGHT, frames=FRAMES, fps=FPS, drive=drive)
     camera = LocalEngine.load(None, "cpu").open_camera()

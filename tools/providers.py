@@ -1,7 +1,7 @@
-"""The shipped networks on every provider that can be had here: milliseconds an input, and how far answers are apart.
+"""Compares the available providers on the shipped networks: milliseconds per input, and how far the outputs differ.
 
-Times are the least of many runs, the providers taking turns: what else the machine does slows all of them alike.
-Inputs are patches and canvases of rendered roads.
+Times are the minimum of many runs. The providers alternate, so that a busy machine slows all of them. Inputs are
+patches and road crops of rendered roads.
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ Inputs = NDArray[np.uint8]
 
 
 @click.command()
-@click.option("--threads", type=click.IntRange(1), help="Threads of a run  [default: one a processor]")
+@click.option("--threads", type=click.IntRange(1), help="Threads per run  [default: one per processor]")
 @click.option("--rounds", type=click.IntRange(1), default=60, show_default=True, help="Runs at each batch size.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures there, too.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the numbers to this file, too.")
 def main(threads: int | None, rounds: int, json_file: Path | None) -> None:
-    """Compare the providers that can be had here."""
-    patches, canvases = _inputs()
-    table = Table("network", "provider", *map(str, _BATCHES), "mean apart", "most apart", box=box.SIMPLE)
-    figures = []
+    """Compare the available providers on the shipped networks."""
+    patches, crops = _inputs()
+    table = Table("network", "provider", *map(str, _BATCHES), "mean difference", "max difference", box=box.SIMPLE)
+    report = []
     for path in _FILES:
-        inputs = canvases if path == SHIPPED_REGRESSOR else patches
+        inputs = crops if path == SHIPPED_REGRESSOR else patches
         networks = _networks(path, RuntimeOptions(threads))
         times = _times(networks, inputs, rounds)
         expected = networks["cpu"].run(inputs)
         for provider, network in networks.items():
-            apart = np.abs(network.run(inputs) - expected)
-            mean, most = float(apart.mean()), float(apart.max())
+            difference = np.abs(network.run(inputs) - expected)
+            mean, greatest = float(difference.mean()), float(difference.max())
             milliseconds = [f"{times[provider, batch]:.2f}" for batch in _BATCHES]
-            table.add_row(path.stem, provider, *milliseconds, f"{mean:.6f}", f"{most:.6f}")
+            table.add_row(path.stem, provider, *milliseconds, f"{mean:.6f}", f"{greatest:.6f}")
             by_batch = {batch: round(times[provider, batch], 3) for batch in _BATCHES}
-            figures.append({"network": path.stem, "provider": provider, "ms": by_batch, "mean": mean, "most": most})
-    # Not to be squeezed into the 80 columns that a pipe counts as.
+            report.append({"network": path.stem, "provider": provider, "ms": by_batch, "mean": mean, "max": greatest})
+    # In a pipe rich would assume 80 columns, which are too few.
     console = Console(width=120)
-    console.print(table, f"ms an input by batch size; {len(patches)} patches, {len(canvases)} canvases")
+    console.print(table, f"ms per input by batch size; {len(patches)} patches, {len(crops)} road crops")
     if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=2))
+        json_file.write_text(json.dumps(report, indent=2))
 
 
 def _inputs() -> Sequence[Inputs]:
-    """What the shipped detectors ask the classifier and the regressor about rendered roads."""
+    """Returns the inputs of the classifier and of the regressor for rendered roads."""
     rng = np.random.default_rng(5)
     stills = [render_still(sample_scene(rng, 640, 360)).image for _ in range(_SCENES)]
     return [
@@ -82,17 +82,17 @@ def _networks(path: Path, options: RuntimeOptions) -> Mapping[str, LoadedModel]:
 
 
 def _times(networks: Mapping[str, LoadedModel], inputs: Inputs, rounds: int) -> Mapping[tuple[str, int], float]:
-    """Milliseconds an input by provider and batch size."""
-    least: dict[tuple[str, int], float] = {}
+    """Returns milliseconds per input by provider and batch size."""
+    fastest: dict[tuple[str, int], float] = {}
     for batch in _BATCHES:
         part = inputs[:batch]
         for _ in range(rounds):
             for provider, network in networks.items():
                 started = time.perf_counter()
                 network.run(part)
-                taken = 1e3 * (time.perf_counter() - started) / batch
-                least[provider, batch] = min(taken, least.get((provider, batch), taken))
-    return least
+                milliseconds = 1e3 * (time.perf_counter() - started) / batch
+                fastest[provider, batch] = min(milliseconds, fastest.get((provider, batch), milliseconds))
+    return fastest
 
 
 if __name__ == "__main__":

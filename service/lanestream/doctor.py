@@ -1,10 +1,14 @@
-"""The command `doctor`: what networks run on here, for people and as JSON."""
+"""The command `doctor`: loads and times the networks, and reports what they run on, as tables or as JSON."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict
+import platform
+import statistics
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,20 +18,69 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from lanestream.diagnosis import Diagnosis, NetworkReport, diagnose
-from lanestream.machine import Cpu, Gpu
+from lanestream import __version__
+from lanestream.engine import SHIPPED_MODEL, resolve_regressor
+from lanestream.errors import LanestreamError
+from lanestream.gpu import Gpu, gpu
+from lanestream.host import Cpu, cpu
+from lanestream.inference import LoadedModel, RegressorInfo, load_model
+from lanestream.inference.providers import NAMES, offered
 from lanestream.runtime import PROVIDERS, Provider
-from lanestream.settings import load_settings
+from lanestream.settings import Settings, load_settings
 
-# Paths and reasons are not to be broken in a pipe.
-_WIDTH_OF_PIPES: Final = 200
+_PACKAGES: Final = ("onnxruntime", "onnxruntime-gpu", "openvino", "numpy", "opencv-python-headless")
+# The batch sizes to time, as far as they are among a model's buckets.
+_BATCH_SIZES: Final = (1, 2, 4, 8, 12, 16, 32, 64)
+_RUNS_PER_BATCH_SIZE: Final = 9
+# Without a terminal, lines are this wide, so that paths and reasons are not broken.
+_PIPE_WIDTH: Final = 200
+
+
+@dataclass(frozen=True)
+class NetworkReport:
+    """A loaded network: its file, the provider that runs it and why, and its speed.
+
+    `fell_back` is true if a better provider is installed but can't be used. `nodes` counts the graph's nodes by what
+    runs them. `run_ms` is the median time of one run in milliseconds, by batch size.
+    """
+
+    file: str
+    sha256: str
+    name: str
+    kind: str
+    precision: str
+    provider: str
+    reason: str
+    fell_back: bool
+    threads: int
+    nodes: Mapping[str, int]
+    load_ms: float
+    warm_up_ms: float
+    run_ms: Mapping[int, float]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything that `doctor` reports. `problem` is one line, or None if nothing is wrong.
+
+    `software` maps installed packages to their versions. `installed` lists the providers that are built in; whether
+    one works shows in `networks`. `asked` is the provider that the networks were asked to run on.
+    """
+
+    software: Mapping[str, str]
+    cpu: Cpu
+    gpu: Gpu
+    installed: tuple[str, ...]
+    asked: Provider
+    networks: tuple[NetworkReport, ...]
+    problem: str | None
 
 
 @click.command()
 @click.option(
-    "--require", "required", type=click.Choice(PROVIDERS[1:]), help="Fail unless the networks run on this one."
+    "--require", "required", type=click.Choice(PROVIDERS[1:]), help="Fail unless all networks run on this provider."
 )
-@click.option("--provider", type=click.Choice(PROVIDERS), help="Where they are asked to run  [default: auto]")
+@click.option("--provider", type=click.Choice(PROVIDERS), help="The provider to run on  [default: auto]")
 @click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
 @click.option(
     "--regressor",
@@ -39,14 +92,14 @@ _WIDTH_OF_PIPES: Final = 200
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 @click.pass_context
 def doctor(context: click.Context, /, required: Provider | None, as_json: bool, **given: Any) -> None:
-    """Tell what networks run on here, and how fast; the settings of a service count here, too."""
+    """Show what the networks run on and how fast they are, with the same settings as `serve`."""
     diagnosis = diagnose(load_settings(**given), required)
     if as_json:
         click.echo(json.dumps(asdict(diagnosis), indent=2))
     else:
         console = Console(highlight=False)
         if not console.is_terminal:
-            console.width = _WIDTH_OF_PIPES
+            console.width = _PIPE_WIDTH
         for table in tables(diagnosis):
             console.print(table)
             console.print()
@@ -55,60 +108,139 @@ def doctor(context: click.Context, /, required: Provider | None, as_json: bool, 
         context.exit(1)
 
 
+def diagnose(settings: Settings, required: Provider | None = None) -> Diagnosis:
+    """Loads and times the networks that a service with these `settings` would run.
+
+    If the settings leave the provider to `auto`, the networks are asked to run on the `required` one. A network that
+    can't be loaded or that runs on another provider than the required one is a problem.
+    """
+    provider = required if required and settings.provider == "auto" else settings.provider
+    networks: list[NetworkReport] = []
+    problem = None
+    try:
+        networks.extend(_load_networks(settings, provider))
+    except LanestreamError as error:
+        problem = str(error)
+    elsewhere = [network for network in networks if required not in (None, "auto", network.provider)]
+    if elsewhere and problem is None:
+        network = elsewhere[0]
+        problem = f"{network.name} runs on {network.provider}, not on {required}: {network.reason}"
+    return Diagnosis(_software(), cpu(), gpu(), _installed_providers(), provider, tuple(networks), problem)
+
+
 def tables(diagnosis: Diagnosis) -> Iterator[Table]:
-    """The diagnosis, for people."""
+    """Yields the diagnosis as tables for a terminal."""
     software = ", ".join(f"{name} {version}" for name, version in diagnosis.software.items())
-    installed = f"{', '.join(diagnosis.installed)}; asked for: {diagnosis.asked}"
-    machine = [("software", software), *_cpu(diagnosis.cpu), *_gpu(diagnosis.gpu), ("providers", installed)]
+    installed = f"{', '.join(diagnosis.installed)}; requested: {diagnosis.asked}"
+    machine = [("software", software), *_cpu_rows(diagnosis.cpu), *_gpu_rows(diagnosis.gpu), ("providers", installed)]
     yield _table("machine", machine)
     for network in diagnosis.networks:
-        yield _table(network.kind, _network(network))
-        yield _times(network)
+        yield _table(network.kind, _network_rows(network))
+        yield _run_times(network)
 
 
-def _cpu(cpu: Cpu) -> list[tuple[str, str]]:
+def _load_networks(settings: Settings, provider: Provider) -> Iterator[NetworkReport]:
+    network, report = _load_network(settings.model or SHIPPED_MODEL, provider, settings)
+    yield report
+    regressor = resolve_regressor(settings.regressor)
+    if regressor is not None and not isinstance(network.info, RegressorInfo):
+        yield _load_network(regressor, provider, settings)[1]
+
+
+def _load_network(path: Path, provider: Provider, settings: Settings) -> tuple[LoadedModel, NetworkReport]:
+    started = time.perf_counter()
+    network = load_model(path, provider, settings.runtime_options)
+    loaded = time.perf_counter()
+    network.warm_up()
+    warm = time.perf_counter()
+    placement = network.placement
+    report = NetworkReport(
+        file=str(path),
+        sha256=network.sha256,
+        name=network.name,
+        kind=network.info.kind,
+        precision=network.info.precision,
+        provider=placement.provider,
+        reason=placement.reason,
+        fell_back=placement.fell_back,
+        threads=placement.threads,
+        nodes=placement.nodes,
+        load_ms=1e3 * (loaded - started),
+        warm_up_ms=1e3 * (warm - loaded),
+        run_ms={size: _median_run_ms(network, size) for size in _BATCH_SIZES if size in network.buckets},
+    )
+    return network, report
+
+
+def _median_run_ms(network: LoadedModel, batch_size: int) -> float:
+    inputs = network.blank(batch_size)
+    times = []
+    for _ in range(_RUNS_PER_BATCH_SIZE):
+        started = time.perf_counter()
+        network.run(inputs)
+        times.append(1e3 * (time.perf_counter() - started))
+    return statistics.median(times)
+
+
+def _software() -> Mapping[str, str]:
+    versions = {"lanestream": __version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def _installed_providers() -> tuple[str, ...]:
+    offer = offered()
+    names = [name for name, known in NAMES.items() if known in offer.onnxruntime]
+    return (*names, *(["openvino"] if offer.openvino else []))
+
+
+def _cpu_rows(cpu: Cpu) -> list[tuple[str, str]]:
     quota = "no quota" if cpu.quota is None else f"a quota of {cpu.quota:g}"
     return [
         ("CPU", cpu.name),
-        ("instructions", " ".join(cpu.flags) or "none that matter"),
+        ("instructions", " ".join(cpu.flags) or "none that speed up networks"),
         ("processors", f"{cpu.used}: {cpu.affinity} by affinity, {quota}"),
     ]
 
 
-def _gpu(gpu: Gpu) -> list[tuple[str, str]]:
-    able = f", good for CUDA {gpu.driver_cuda}" if gpu.driver_cuda else ""
-    built = f", onnxruntime is built for {gpu.onnxruntime_cuda}" if gpu.onnxruntime_cuda else ""
+def _gpu_rows(gpu: Gpu) -> list[tuple[str, str]]:
+    supported = f", supports CUDA {gpu.driver_cuda}" if gpu.driver_cuda else ""
+    built_for = f", onnxruntime is built for {gpu.onnxruntime_cuda}" if gpu.onnxruntime_cuda else ""
     return [
         ("GPU", "; ".join(gpu.devices) or "none"),
-        ("driver", (gpu.driver or "none") + able),
-        ("CUDA", (gpu.cuda or "none") + built),
+        ("driver", (gpu.driver or "none") + supported),
+        ("CUDA", (gpu.cuda or "none") + built_for),
         ("cuDNN", gpu.cudnn or "none"),
         ("TensorRT", gpu.tensorrt or "none"),
     ]
 
 
-def _network(network: NetworkReport) -> list[tuple[str, str]]:
+def _network_rows(network: NetworkReport) -> list[tuple[str, str]]:
     return [
         ("model", f"{network.name}, {network.precision}"),
         ("file", network.file),
         ("sha256", network.sha256),
         ("provider", f"{network.provider}: {network.reason}"),
-        ("nodes", ", ".join(f"{count} {where}" for where, count in network.nodes.items())),
+        ("nodes", ", ".join(f"{count} {runner}" for runner, count in network.nodes.items())),
         ("threads", str(network.threads)),
-        ("ready after", f"{network.load_ms:.0f} ms to load, {network.warm_up_ms:.0f} ms to warm up"),
+        ("start", f"{network.load_ms:.0f} ms to load, {network.warm_up_ms:.0f} ms to warm up"),
     ]
 
 
 def _table(title: str, rows: list[tuple[str, str]]) -> Table:
     table = Table(title, "", show_edge=False, box=box.SIMPLE_HEAD, padding=(0, 2, 0, 0))
-    for name, told in rows:
-        # Not markup: brackets in a path are brackets.
-        table.add_row(Text(name, style="bold"), Text(told))
+    for name, value in rows:
+        # Text, because rich would take brackets in a path for markup.
+        table.add_row(Text(name, style="bold"), Text(value))
     return table
 
 
-def _times(network: NetworkReport) -> Table:
-    table = Table("batch", "median ms a run", "ms an input", box=box.SIMPLE_HEAD, show_edge=False)
-    for batch, taken in network.run_ms.items():
-        table.add_row(str(batch), f"{taken:.2f}", f"{taken / batch:.3f}")
+def _run_times(network: NetworkReport) -> Table:
+    table = Table("batch size", "median ms per run", "ms per input", box=box.SIMPLE_HEAD, show_edge=False)
+    for batch_size, milliseconds in network.run_ms.items():
+        table.add_row(str(batch_size), f"{milliseconds:.2f}", f"{milliseconds / batch_size:.3f}")
     return table

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from lanestream.engine import load_engine, resolve_regressor
-from lanestream.images.decoding import MOST_PIXELS, ImageLimits, Picture, decode_reduced
+from lanestream.images.decoding import MOST_PIXELS, DecodedImage, ImageLimits, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.road.view import WORKING_WIDTH
 
@@ -65,7 +65,7 @@ class LocalCamera:
         Raises ImageError if the file cannot be decoded, and leaves the session as it was.
         """
         started = time.perf_counter()
-        picture = decode_reduced(image, _LIMITS, WORKING_WIDTH) if isinstance(image, bytes) else Picture(image)
+        picture = decode_reduced(image, _LIMITS, WORKING_WIDTH) if isinstance(image, bytes) else DecodedImage(image)
         decoded = time.perf_counter()
         result = self._engine.process(self._session, picture.image, timestamp)
         total = 1e3 * (time.perf_counter() - started)

@@ -25,7 +25,7 @@ from lanestream.road.curve import Curves
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lanestream.images.decoding import Picture
+    from lanestream.images.decoding import DecodedImage
     from lanestream.road.curve import FloatArray
     from lanestream.road.results import EgoLane, FrameResult, LaneBoundary
 
@@ -47,7 +47,7 @@ class ProcessedFrame:
     result: FrameResult
 
     @classmethod
-    def of(cls, picture: Picture, result: FrameResult, timing_ms: dict[str, float]) -> ProcessedFrame:
+    def of(cls, picture: DecodedImage, result: FrameResult, timing_ms: dict[str, float]) -> ProcessedFrame:
         """From the `result` in pixels of the decoded image."""
         return cls(picture.size, replace(result.to_image(picture.scaling), timing_ms=timing_ms))
 

@@ -22,9 +22,9 @@ from pydantic_settings import (
 )
 
 from lanestream.errors import SettingsError
+from lanestream.host import network_threads, processors
 from lanestream.images.decoding import MOST_PIXELS, ImageLimits
 from lanestream.keys import ApiKey, parse_keys
-from lanestream.processors import network_threads, processors
 from lanestream.runtime import Provider, RuntimeOptions
 from lanestream.streaming.session_registry import SessionLimits
 from lanestream.streaming.stream_protocol import StreamLimits

@@ -1,4 +1,4 @@
-"""The benchmark with real contestants, for a moment each: that all of them answer, and what is written."""
+"""A short benchmark with the real runners: that all of them reply, and what is written."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from pathlib import Path
 import psutil
 import pytest
 from bench.__main__ import main, measure
-from bench.plan import CONTESTANTS, LARGE, Plan
-from bench.table import HEADLINES
+from bench.report import HEADLINES
+from bench.runners import litserve_installed
+from bench.workload import LARGE, LITSERVE, RUNNERS, Suite
 from click.testing import CliRunner
 
-PLAN = Plan(
+SUITE = Suite(
     rounds=1,
     sizes=(LARGE,),
     sessions=(1,),
@@ -25,37 +26,40 @@ PLAN = Plan(
 )
 
 
-def marked(value: str) -> list[str]:
-    """The commands of all processes that have `value` for TEST_RUN, whoever has become their parent."""
-    found = []
+def commands_of_run(value: str) -> list[str]:
+    """Returns the commands of all processes whose TEST_RUN is `value`, even if their parent has ended."""
+    commands = []
     for process in psutil.process_iter():
         with suppress(psutil.Error):
             if process.environ().get("TEST_RUN") == value:
-                found.append(" ".join(process.cmdline()))
-    return found
+                commands.append(" ".join(process.cmdline()))
+    return commands
 
 
-def test_all_contestants_answer_and_none_is_left_behind(
+def test_all_runners_reply_and_no_process_is_left(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TEST_RUN", str(tmp_path))
-    measure(PLAN, "cpu", None, 3, tmp_path)
-    told = json.loads((tmp_path / "bench.json").read_text())
-    assert set(HEADLINES) - {"at_64_over_at_4"} <= told.keys()
-    assert told["failed"] == 0
-    assert {cell["contestant"] for cell in told["cells"] if cell["answers"] > 0} == set(CONTESTANTS)
-    assert told["overload"][0]["p50_age_ms"] > 0.0
-    assert told["soak"]["failed"] == 0
-    assert 0.0 < told["candidates_per_frame"] <= 16.0
-    assert told["provider"] == "cpu"
-    assert all(cell["memory_mb"] > 10.0 for cell in told["cells"])
-    assert "| service |" in capsys.readouterr().out
-    # What Python itself keeps for processes that it spawns may stay.
-    assert [command for command in marked(str(tmp_path)) if "resource_tracker" not in command] == []
+    measure(SUITE, "cpu", None, 3, tmp_path)
+    content = json.loads((tmp_path / "bench.json").read_text())
+    assert set(HEADLINES) - {"at_64_over_at_4"} <= content.keys()
+    assert content["failed"] == 0
+    expected = set(RUNNERS) - (set() if litserve_installed() else {LITSERVE})
+    assert {row["runner"] for row in content["workloads"] if row["replies"] > 0} == expected
+    assert content["overload"][0]["p50_age_ms"] > 0.0
+    assert content["soak"]["failed"] == 0
+    assert 0.0 < content["candidates_per_frame"] <= 16.0
+    assert content["provider"] == "cpu"
+    assert all(row["memory_mb"] > 10.0 for row in content["workloads"])
+    output = capsys.readouterr().out
+    assert "| service |" in output
+    assert ("LitServe is not installed" in output) != litserve_installed()
+    # Python keeps its own resource tracker for spawned processes.
+    assert [command for command in commands_of_run(str(tmp_path)) if "resource_tracker" not in command] == []
 
 
-def test_a_clip_that_is_not_there_is_told_in_one_line(tmp_path: Path) -> None:
-    done = CliRunner().invoke(main, ["--clip", "nowhere.mp4", "--out", str(tmp_path)])
-    assert done.exit_code == 1
-    assert "no such file or folder: nowhere.mp4" in done.output
-    assert "Traceback" not in done.output
+def test_a_missing_clip_is_an_error_without_a_traceback(tmp_path: Path) -> None:
+    result = CliRunner().invoke(main, ["--clip", "nowhere.mp4", "--out", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "no such file or folder: nowhere.mp4" in result.output
+    assert "Traceback" not in result.output

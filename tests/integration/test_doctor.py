@@ -1,4 +1,4 @@
-"""`lanestream doctor` in a process of its own: what it tells, and that what is required is required."""
+"""`lanestream doctor` as a command: what it reports, and that `--require` fails on other providers."""
 
 import hashlib
 import json
@@ -12,21 +12,21 @@ import pytest
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR
 
 
-def doctor(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_doctor(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "error", "-m", "lanestream.cli", "doctor", *arguments]
     environment = {**os.environ, **variables}
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=120)
 
 
-def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
-    diagnosis: dict[str, Any] = json.loads(done.stdout)
+def diagnosis_of(result: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    diagnosis: dict[str, Any] = json.loads(result.stdout)
     return diagnosis
 
 
 def test_the_shipped_networks_are_loaded_and_timed() -> None:
-    done = doctor("--json", "--provider", "cpu", "--require", "cpu", LANESTREAM_INFERENCE_THREADS="1")
-    assert (done.returncode, done.stderr) == (0, "")
-    diagnosis = told(done)
+    result = run_doctor("--json", "--provider", "cpu", "--require", "cpu", LANESTREAM_INFERENCE_THREADS="1")
+    assert (result.returncode, result.stderr) == (0, "")
+    diagnosis = diagnosis_of(result)
     assert diagnosis["problem"] is None
     assert {"lanestream", "python", "onnxruntime"} <= set(diagnosis["software"])
     networks = diagnosis["networks"]
@@ -37,20 +37,20 @@ def test_the_shipped_networks_are_loaded_and_timed() -> None:
         assert set(network["nodes"]) == {"CPU"}
         assert not network["fell_back"]
         assert list(network["run_ms"]) == ["1", "2", "4", "8", "12", "16"]
-        assert all(taken > 0.0 for taken in network["run_ms"].values())
+        assert all(milliseconds > 0.0 for milliseconds in network["run_ms"].values())
 
 
-def test_people_are_told_in_tables_that_a_pipe_does_not_break() -> None:
-    done = doctor("--model", str(SHIPPED_REGRESSOR))
-    assert (done.returncode, done.stderr) == (0, "")
-    lines = [line.rstrip() for line in done.stdout.splitlines()]
+def test_the_tables_have_unbroken_lines_in_a_pipe() -> None:
+    result = run_doctor("--model", str(SHIPPED_REGRESSOR))
+    assert (result.returncode, result.stderr) == (0, "")
+    lines = [line.rstrip() for line in result.stdout.splitlines()]
     assert any(line.startswith("GPU") for line in lines)
     assert any(line.endswith(str(SHIPPED_REGRESSOR)) for line in lines)
     assert not any(line.startswith("classifier") for line in lines)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         (("--require", "cuda"), "the installed onnxruntime has no CUDA"),
         (("--require", "tensorrt"), "the installed onnxruntime has no TensorRT"),
@@ -62,26 +62,26 @@ def test_people_are_told_in_tables_that_a_pipe_does_not_break() -> None:
         (("--regressor", "none.onnx", "--provider", "cpu"), "no model file at none.onnx"),
     ],
 )
-def test_what_is_wrong_is_one_line_below_what_was_found(arguments: tuple[str, ...], words: str) -> None:
-    done = doctor("--json", *arguments)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
-    assert words in done.stderr
-    diagnosis = told(done)
-    assert words in diagnosis["problem"]
+def test_a_problem_is_one_line_after_the_report(arguments: tuple[str, ...], message: str) -> None:
+    result = run_doctor("--json", *arguments)
+    assert result.returncode == 1
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert message in result.stderr
+    diagnosis = diagnosis_of(result)
+    assert message in diagnosis["problem"]
     assert diagnosis["cpu"]["used"] >= 1
 
 
 def test_openvino_can_be_required() -> None:
-    done = doctor("--json", "--require", "openvino", "--regressor", "none")
-    assert (done.returncode, done.stderr) == (0, "")
-    network = told(done)["networks"][0]
+    result = run_doctor("--json", "--require", "openvino", "--regressor", "none")
+    assert (result.returncode, result.stderr) == (0, "")
+    network = diagnosis_of(result)["networks"][0]
     assert network["provider"] == "openvino"
     assert network["nodes"]["CPU u8"] > 10
 
 
-def test_a_setting_that_is_not_accepted_is_told_at_once() -> None:
-    done = doctor(LANESTREAM_PROVIDER="quantum")
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("error: LANESTREAM_PROVIDER = 'quantum': ")
+def test_an_invalid_setting_is_an_error_without_a_report() -> None:
+    result = run_doctor(LANESTREAM_PROVIDER="quantum")
+    assert (result.returncode, result.stdout) == (1, "")
+    assert result.stderr.startswith("error: LANESTREAM_PROVIDER = 'quantum': ")

@@ -1,4 +1,4 @@
-"""The image's health check, run as the engine runs it, beside a real server."""
+"""The image's health check, run as the container engine runs it, against a real server."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ def check(**environment: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", ""])  # noqa: S104
-def test_a_ready_service_is_well_whatever_proxy_there_is_for_the_outside(url: str, host: str) -> None:
+def test_a_ready_service_is_healthy_and_no_proxy_is_used(url: str, host: str) -> None:
     port = str(urlsplit(url).port)
-    done = check(LANESTREAM_HOST=host, LANESTREAM_PORT=port, http_proxy="http://127.0.0.1:9")
-    assert (done.returncode, done.stderr) == (0, "")
+    result = check(LANESTREAM_HOST=host, LANESTREAM_PORT=port, http_proxy="http://127.0.0.1:9")
+    assert (result.returncode, result.stderr) == (0, "")
 
 
-def test_a_service_that_still_loads_is_not_well_and_says_why(serve: Callable[..., str]) -> None:
-    done = check(LANESTREAM_PORT=str(urlsplit(serve()).port))
-    assert done.returncode == 1
-    assert "/readyz: 503" in done.stderr
-    assert "not_ready" in done.stderr
+def test_a_loading_service_is_not_healthy_and_the_reason_is_reported(serve: Callable[..., str]) -> None:
+    result = check(LANESTREAM_PORT=str(urlsplit(serve()).port))
+    assert result.returncode == 1
+    assert "/readyz: 503" in result.stderr
+    assert "not_ready" in result.stderr
 
 
-def test_where_nobody_listens_nothing_is_well() -> None:
+def test_without_a_service_the_check_fails() -> None:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    done = check(LANESTREAM_PORT=str(port))
-    assert done.returncode == 1
-    assert "refused" in done.stderr
+    result = check(LANESTREAM_PORT=str(port))
+    assert result.returncode == 1
+    assert "refused" in result.stderr

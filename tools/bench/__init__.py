@@ -1,1 +1,1 @@
-"""`make bench`: the service beside the pipeline in process, a naive service and LitServe, on the same frames."""
+"""`make bench`: the service against the in-process pipeline, a baseline service and LitServe, on the same frames."""

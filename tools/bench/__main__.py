@@ -8,23 +8,22 @@ from pathlib import Path
 
 import click
 
-from bench.figures import figures
 from bench.frames import load_clips
-from bench.measuring import bench
-from bench.plan import QUICK, Plan
+from bench.measure import benchmark, run_suite
 from bench.plot import plot
-from bench.running import run
-from bench.table import markdown
+from bench.report import markdown, report
+from bench.runners import litserve_installed
+from bench.workload import QUICK, Suite
 from lanestream.errors import LanestreamError
 from lanestream.runtime import PROVIDERS, Provider
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="About a minute, to see that it works; the figures are rough.")
-@click.option("--rounds", type=click.IntRange(1), help="How often everything is measured  [default: 5]")
-@click.option("--soak-minutes", type=click.FloatRange(0.01), help="How long too many frames are pushed  [default: 0.5]")
+@click.option("--quick", is_flag=True, help="Takes about a minute, to see that it works; the numbers are rough.")
+@click.option("--rounds", type=click.IntRange(1), help="Rounds over all workloads  [default: 5]")
+@click.option("--soak-minutes", type=click.FloatRange(0.01), help="Minutes of overload at the end  [default: 0.5]")
 @click.option("--clip", help="A video or a folder of images  [default: a rendered drive]")
-@click.option("--frames", type=click.IntRange(1), default=24, show_default=True, help="Frames of it that are sent.")
+@click.option("--frames", type=click.IntRange(1), default=24, show_default=True, help="Frames of it to send.")
 @click.option("--provider", type=click.Choice(PROVIDERS), default="auto", show_default=True)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out"), show_default=True)
 def main(
@@ -36,28 +35,30 @@ def main(
     provider: Provider,
     out: Path,
 ) -> None:
-    """Measure the service, the pipeline in process, a naive service and LitServe on the same frames, by turns."""
-    plan = QUICK if quick else Plan()
-    plan = replace(plan, rounds=rounds or plan.rounds, soak_minutes=soak_minutes or plan.soak_minutes)
+    """Compare the service with the in-process pipeline, a baseline service and LitServe, on the same frames."""
+    suite = QUICK if quick else Suite()
+    suite = replace(suite, rounds=rounds or suite.rounds, soak_minutes=soak_minutes or suite.soak_minutes)
     try:
-        measure(plan, provider, clip, frames, out)
+        measure(suite, provider, clip, frames, out)
     except (LanestreamError, RuntimeError, OSError) as error:
         raise click.ClickException(str(error)) from error
 
 
-def measure(plan: Plan, provider: Provider, clip: str | None, frames: int, out: Path) -> None:
-    """Goes through `plan` and writes what it came to into the folder `out`."""
+def measure(suite: Suite, provider: Provider, clip: str | None, frames: int, out: Path) -> None:
+    """Measures `suite`, writes the report and its figure into the folder `out` and prints the tables."""
+    if not litserve_installed():
+        click.echo("LitServe is not installed and is left out (to compare with it: pip install -e '.[bench-litserve]')")
     out.mkdir(parents=True, exist_ok=True)
-    clips = load_clips(plan.sizes, frames, clip)
+    clips = load_clips(suite.sizes, frames, clip)
     source = "a rendered drive" if clip is None else Path(clip).name
-    count = len(clips[plan.sizes[0]])
-    with bench(clips, provider, out) as contestants:
-        results = run(contestants, plan, click.echo)
-        told = figures(results, plan, contestants.hello, f"{count} frames of {source}")
+    count = len(clips[suite.sizes[0]])
+    with benchmark(clips, provider, out) as bench:
+        results = run_suite(bench, suite, click.echo)
+        content = report(results, suite, bench.info, f"{count} frames of {source}")
     path = out / "bench.json"
-    path.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
-    plot(told, out / "bench.png")
-    for line in markdown(told):
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    plot(content, out / "bench.png")
+    for line in markdown(content):
         click.echo(line)
     click.echo(f"\nwrote {path} and {path.with_suffix('.png')}")
 

@@ -1,4 +1,4 @@
-"""The frames that all contestants are sent: a drive as JPEG files in memory, in both sizes."""
+"""The frames that all runners get: a drive as JPEG files in memory, in both sizes."""
 
 from __future__ import annotations
 
@@ -9,37 +9,37 @@ from typing import Final
 import cv2
 import numpy as np
 
-from bench.plan import Size
+from bench.workload import Size
 from lanestream.road.view import Image
 from lanestream_client.sources import open_source
 from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
 SEED: Final = 24
 FPS: Final = 25.0
-QUALITY: Final = 90
+JPEG_QUALITY: Final = 90
 
 # The JPEG files of each size, in the order of the drive.
 Clips = Mapping[Size, Sequence[bytes]]
 
 
 def load_clips(sizes: Sequence[Size], count: int, clip: str | None = None) -> Clips:
-    """The first `count` frames of `clip` (a video or a folder of images), of a rendered drive where None.
+    """Returns the first `count` frames of `clip` (a video or a folder of images), or of a rendered drive if None.
 
-    Raises SourceError where `clip` can't be read.
+    Raises SourceError if `clip` can't be read.
     """
-    images = _rendered(max(sizes), count) if clip is None else _read(clip, count)
-    return {size: [_encoded(_fitted(image, size)) for image in images] for size in sizes}
+    images = _render(max(sizes), count) if clip is None else _read(clip, count)
+    return {size: [_encode(_fit(image, size)) for image in images] for size in sizes}
 
 
-def to_and_fro(number: int, count: int) -> int:
-    """Which of `count` frames is the `number`-th of an endless drive: forth and back again, without a cut."""
+def forward_and_backward(number: int, count: int) -> int:
+    """Returns the index, among `count` frames, of frame `number` of an endless drive that alternates direction."""
     if count == 1:
         return 0
-    turn = number % (2 * count - 2)
-    return min(turn, 2 * count - 2 - turn)
+    index = number % (2 * count - 2)
+    return min(index, 2 * count - 2 - index)
 
 
-def _rendered(size: Size, count: int) -> list[Image]:
+def _render(size: Size, count: int) -> list[Image]:
     drive = Drive("highway", fair=True)
     clip = sample_clip(np.random.default_rng(SEED), *size, frames=count, fps=FPS, drive=drive)
     return [frame.image for frame in render_clip(clip)]
@@ -48,22 +48,22 @@ def _rendered(size: Size, count: int) -> list[Image]:
 def _read(clip: str, count: int) -> list[Image]:
     with open_source(clip) as source:
         frames = list(islice(source.frames, count))
-    return [_decoded(frame.data) if frame.pixels is None else frame.pixels for frame in frames]
+    return [_decode(frame.data) if frame.pixels is None else frame.pixels for frame in frames]
 
 
-def _decoded(data: bytes | None) -> Image:
+def _decode(data: bytes | None) -> Image:
     image = cv2.imdecode(np.frombuffer(data or b"", np.uint8), cv2.IMREAD_COLOR)
     return np.asarray(image, np.uint8)
 
 
-def _fitted(image: Image, size: Size) -> Image:
-    """The image at `size`; what is too high for it is cut off at the top, where the sky is."""
+def _fit(image: Image, size: Size) -> Image:
+    """Returns the image at `size`. If it is too high, its top is cut off, where the sky is."""
     width, height = size
     scale = width / image.shape[1]
-    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
-    resized = cv2.resize(image, (width, max(height, round(image.shape[0] * scale))), interpolation=how)
+    interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+    resized = cv2.resize(image, (width, max(height, round(image.shape[0] * scale))), interpolation=interpolation)
     return np.asarray(resized[resized.shape[0] - height :], np.uint8)
 
 
-def _encoded(image: Image) -> bytes:
-    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1])
+def _encode(image: Image) -> bytes:
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from lanestream.processors import processors
+from lanestream.host import processors
 from lanestream_exporter.datasets.splits import data_root, real_frames, training_frames
 from lanestream_exporter.samples.cache import files_of
 from lanestream_exporter.samples.road_frames import read_frames, rendered_frames, road_frames

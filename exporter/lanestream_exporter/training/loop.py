@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from lanestream.errors import SettingsError
-from lanestream.processors import processors
+from lanestream.host import processors
 from lanestream_exporter.alexnet import load_state
 from lanestream_exporter.training.average import WeightAverage
 from lanestream_exporter.training.checkpoints import made_by, write_checkpoint

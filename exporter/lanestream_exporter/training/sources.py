@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lanestream.processors import processors
+from lanestream.host import processors
 from lanestream_exporter.datasets.splits import data_root, real_frames, training_frames
 from lanestream_exporter.samples.cache import files_of
 from lanestream_exporter.samples.patch_files import PatchStores

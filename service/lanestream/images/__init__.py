@@ -1,1 +1,1 @@
-"""Image files: their headers, limits and decoding."""
+"""Image files: checks before decoding, and decoding."""

@@ -1,7 +1,7 @@
-"""Bytes to a checked, decoded frame: every limit is tested on the file's header, before any pixel is decoded.
+"""Decodes image files. All limits are checked on the file's header, before any pixel is decoded.
 
-Two walls stand before a decompression bomb: the pixel size read from the header here, and OpenCV's own limit, which it
-reads once from the environment when it is first imported.
+Two checks stop decompression bombs: the size in the header is checked here, and OpenCV has a limit of its own, which it
+reads from the environment once, when it is first imported.
 """
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import ImageError, ImageTooLargeError
-from lanestream.images.header import Header, corrupt, read_body, read_header
+from lanestream.images.header import Header, corrupt_image, read_body, read_header
 from lanestream.road.view import Scaling
 
 if TYPE_CHECKING:
     from lanestream.road.view import Image
 
-# More than any setting allows; only OpenCV's first import in the process sees it.
+# OpenCV's own limit. No setting allows more. It takes effect only if OpenCV was not imported before.
 MOST_PIXELS: Final = 1 << 26
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
 
-import cv2  # noqa: E402  (the limit above has to stand first)
+import cv2  # noqa: E402  (the limit above has to be set first)
 import numpy as np  # noqa: E402
 
-# How OpenCV is told to decode an image whole, at a half, at a quarter and at an eighth of its size.
-_REDUCED: Final = {
+# OpenCV's flag for each reduction: full size, and a half, a quarter and an eighth of it on each side.
+_FLAGS: Final = {
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """What is accepted: bytes and pixels at most, pixels at least on the shorter side, and how elongated it may be.
+    """Which images are accepted: `min_side` is in pixels, `max_aspect` the longer side over the shorter one.
 
-    Frames are worked on at one width, so that a very tall one would cost more than its pixels tell.
+    All frames are scaled to the same width, so a very tall one would cost more than its number of pixels suggests.
     """
 
     max_bytes: int = 8 << 20
@@ -44,70 +44,72 @@ class ImageLimits:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A decoded image: BGR pixels `image` (H, W, 3) uint8, upright; those of its file are `reduced` times as many."""
+class DecodedImage:
+    """A decoded image: upright BGR pixels `image` (H, W, 3) uint8. Its file is `reduction` times as wide and high."""
 
     image: Image
-    reduced: int = 1
+    reduction: int = 1
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the image in its file."""
-        return self.image.shape[1] * self.reduced, self.image.shape[0] * self.reduced
+        """Width and height of the image file."""
+        return self.image.shape[1] * self.reduction, self.image.shape[0] * self.reduction
 
     @property
     def scaling(self) -> Scaling:
-        """From pixels of the file to those of `image`."""
-        return Scaling(1.0 / self.reduced)
+        """The scaling from pixels of the file to pixels of `image`."""
+        return Scaling(1.0 / self.reduction)
 
 
 def decode(data: bytes, limits: ImageLimits) -> Image:
-    """The image in `data`, a JPEG, PNG or WebP file, as BGR (H, W, 3) uint8, upright as its EXIF orientation says.
+    """Returns the image in `data`, a JPEG, PNG or WebP file, as BGR (H, W, 3) uint8, upright by its EXIF orientation.
 
-    Raises ImageTooLargeError beyond the limits, and ImageError where it is no image, too small, cut short or corrupt.
+    Raises ImageTooLargeError if it exceeds the limits, and ImageError if `data` is not an image, or if the image is too
+    small, too elongated, cut short or corrupt.
     """
-    header = _checked(data, limits)
-    return _decoded(data, header, 1)
+    return _decode_checked(data, _check(data, limits), 1)
 
 
-def decode_reduced(data: bytes, limits: ImageLimits, least_width: int) -> Picture:
-    """The image in `data` at a half, a quarter or an eighth of its size, as long as it is `least_width` pixels wide.
+def decode_reduced(data: bytes, limits: ImageLimits, min_width: int) -> DecodedImage:
+    """Returns the image in `data` at full size, a half, a quarter or an eighth, but at least `min_width` pixels wide.
 
-    That costs less than to decode it and to reduce it then. Raises what `decode` raises.
+    That is faster than reducing it after decoding. Raises ImageTooLargeError and ImageError for the same images as
+    `decode`.
     """
-    header = _checked(data, limits)
-    reduced = max(by for by in _REDUCED if (header.width >= by * least_width and _divides(by, header)) or by == 1)
-    image = _decoded(data, header, reduced)
-    if image.shape[1] * reduced != header.width:  # turned by EXIF, and its height is not known to suffice
-        return Picture(_decoded(data, header, 1))
-    return Picture(image, reduced)
+    header = _check(data, limits)
+    reduction = max(n for n in _FLAGS if n == 1 or (header.width >= n * min_width and _is_divisible(header, n)))
+    image = _decode_checked(data, header, reduction)
+    if image.shape[1] * reduction != header.width:
+        # The EXIF orientation swapped the sides, so the image may be narrower than `min_width` now.
+        return DecodedImage(_decode_checked(data, header, 1))
+    return DecodedImage(image, reduction)
 
 
-def _divides(by: int, header: Header) -> bool:
-    return header.width % by == 0 and header.height % by == 0
+def _is_divisible(header: Header, n: int) -> bool:
+    return header.width % n == 0 and header.height % n == 0
 
 
-def _checked(data: bytes, limits: ImageLimits) -> Header:
+def _check(data: bytes, limits: ImageLimits) -> Header:
     _check_bytes(len(data), limits)
     header = read_header(data)
     _check_size(header, limits)
     return header
 
 
-def _decoded(data: bytes, header: Header, reduced: int) -> Image:
-    """The pixels of a checked image file, each side divided by `reduced`."""
+def _decode_checked(data: bytes, header: Header, reduction: int) -> Image:
+    """Returns the pixels of a checked image file, each side divided by `reduction`."""
     try:
-        image = cv2.imdecode(np.frombuffer(read_body(data, header), np.uint8), _REDUCED[reduced])
+        image = cv2.imdecode(np.frombuffer(read_body(data, header), np.uint8), _FLAGS[reduction])
     except cv2.error:
         image = None
-    # A turn by EXIF swaps the sides; any other difference means that the limits were checked on another image.
-    if image is None or sorted(image.shape[:2]) != sorted((header.width // reduced, header.height // reduced)):
-        raise corrupt(header.kind)
+    # The EXIF orientation may swap the sides. After any other difference the limits were checked on another image.
+    if image is None or sorted(image.shape[:2]) != sorted((header.width // reduction, header.height // reduction)):
+        raise corrupt_image(header.kind)
     return np.asarray(image, np.uint8)
 
 
 def _check_bytes(size: int, limits: ImageLimits) -> None:
-    """Raises ImageTooLargeError where an image of `size` bytes is more than the limits allow."""
+    """Raises ImageTooLargeError if a file of `size` bytes exceeds the limits."""
     if size > limits.max_bytes:
         raise ImageTooLargeError(
             f"the image has {size:,} bytes; at most {limits.max_bytes:,} are accepted", "send it as a JPEG"
@@ -119,15 +121,15 @@ def _check_size(header: Header, limits: ImageLimits) -> None:
     if header.width * header.height > limits.max_pixels:
         raise ImageTooLargeError(
             f"the image is {size}, {header.width * header.height:,} pixels; at most {limits.max_pixels:,} are accepted",
-            "scale it down; 1280 x 720 is plenty",
+            "scale it down, 1280 x 720 is enough",
         )
     if min(header.width, header.height) < limits.min_side:
         raise ImageError(
-            f"the image is {size}; too small to show a road",
-            f"at least {limits.min_side} pixels on each side are accepted, 320 x 180 or more is useful",
+            f"the image is {size}, too small to show a road",
+            f"at least {limits.min_side} pixels on each side are accepted, use 320 x 180 or more",
         )
     if max(header.width, header.height) > limits.max_aspect * min(header.width, header.height):
         raise ImageError(
-            f"the image is {size}; too elongated to show a road",
-            f"one side may be {limits.max_aspect} times the other at most",
+            f"the image is {size}, too elongated to show a road",
+            f"one side may be at most {limits.max_aspect} times the other",
         )

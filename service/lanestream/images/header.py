@@ -1,7 +1,7 @@
-"""What can be known of an image file without decoding it, and the part of it that a decoder needs.
+"""Reads the format and size of image files without decoding them, and extracts the part that a decoder needs.
 
-A file is told apart by its first bytes and measured by its header. The rest is walked through chunk by chunk, because
-each format lets a small file ask for a lot of work that has nothing to do with its pixels.
+The format is recognized by the first bytes, the size is read from the header. The rest is scanned chunk by chunk,
+because every format lets a small file cause a lot of work that has nothing to do with its pixels.
 """
 
 from __future__ import annotations
@@ -16,36 +16,38 @@ from lanestream.errors import ImageError
 
 ACCEPTED: Final = "JPEG, PNG or WebP are accepted"
 
-# Inside JPEG scans 0xff is followed by a stuffed zero, a restart marker or padding; whatever else follows is a marker.
+# Inside JPEG scans 0xff is followed by a stuffed zero, a restart marker or padding; anything else is a marker.
 _JPEG_MARKER: Final = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])")
 _JPEG_FIRST: Final = 0xC0
 _JPEG_SIZE_MARKERS: Final = frozenset(range(_JPEG_FIRST, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_START_OF_SCAN: Final = 0xDA
 _JPEG_END: Final = 0xD9
-# A marker without a length: what decoders read right after it must not be skipped here.
+# TEM, a marker without a length: decoders read on right after it.
 _JPEG_TEMPORARY: Final = 0x01
-# Every scan of a progressive JPEG is a pass over all pixels, and an empty one costs its sender only a few bytes.
-_MOST_JPEG_SCANS: Final = 100
-_MOST_JPEG_SEGMENTS: Final = 2000
+# Every scan of a progressive JPEG is a pass over all pixels, and an empty scan takes only a few bytes.
+_MAX_JPEG_SCANS: Final = 100
+_MAX_JPEG_SEGMENTS: Final = 2000
 
-_PNG_CHUNKS_AT: Final = 8
-_MOST_PNG_CHUNKS: Final = 10_000
-# Beside the chunks that every decoder has to know: transparency, and which side is up.
+_PNG_FIRST_CHUNK: Final = 8
+_MAX_PNG_CHUNKS: Final = 10_000
+# Optional chunks that are kept: transparency, and EXIF for the orientation.
 _PNG_KEPT: Final = frozenset({b"tRNS", b"eXIf"})
+# This bit of the first byte of a chunk's name marks optional chunks.
 _PNG_OPTIONAL: Final = 0x20
 _PNG_CHANNELS: Final = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-# Deflate makes of one byte that many at most; a decoder inflates all of them, also those that are no pixels. What that
-# costs in vain is less than a second; to make sure of less would cost every PNG of a camera as much as its decoding.
+# Deflate expands one byte to at most this many. A decoder inflates all data, even those beyond the last pixel.
 _DEFLATE_RATIO: Final = 1032
-_INFLATED_FOR_NOTHING: Final = 1 << 30
+# Bytes beyond the pixels that a decoder may inflate. They take less than a second. A stricter check would cost as much
+# for every ordinary PNG as decoding it.
+_MAX_EXCESS_BYTES: Final = 1 << 30
 _INFLATE_STEP: Final = 1 << 18
 
 _BINARY: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 
 @dataclass(frozen=True)
-class Format:
-    """A kind of image file: how it begins, how its (width, height) is read, and how what a decoder needs is got."""
+class ImageFormat:
+    """An image format: its first bytes, and functions that read (width, height) and the part that a decoder needs."""
 
     kind: str
     magic: bytes
@@ -55,20 +57,20 @@ class Format:
 
 @dataclass(frozen=True)
 class Header:
-    """What an image file says of itself at its beginning: pixels before any turn that its EXIF data ask for."""
+    """An image file's format, and its size in pixels before the EXIF orientation is applied."""
 
-    format: Format
+    format: ImageFormat
     width: int
     height: int
 
     @property
     def kind(self) -> str:
-        """JPEG, PNG or WebP."""
+        """The format's name: JPEG, PNG or WebP."""
         return self.format.kind
 
 
 def read_header(data: bytes) -> Header:
-    """Kind and size of the image file in `data`, nothing decoded. Raises ImageError where it is none of the kinds."""
+    """Returns the format and size of the image file in `data`. Raises ImageError if it has no accepted format."""
     for each in _FORMATS:
         if data.startswith(each.magic):
             try:
@@ -81,9 +83,9 @@ def read_header(data: bytes) -> Header:
 
 
 def read_body(data: bytes, header: Header) -> bytes:
-    """The file in `data` with nothing in it but what a decoder needs for its pixels.
+    """Returns the file in `data` reduced to what a decoder needs for the pixels.
 
-    Raises ImageError where it is cut short or asks for far more work than its pixels do.
+    Raises ImageError if it is cut short or would take far more work than its pixels need.
     """
     try:
         return header.format.read_body(data)
@@ -91,18 +93,19 @@ def read_body(data: bytes, header: Header) -> bytes:
         raise ImageError(f"the {header.kind} image is cut short: its end is missing", "send the whole file") from None
 
 
-def corrupt(kind: str) -> ImageError:
-    """The error of a file that begins as one of a kind and can't be decoded."""
+def corrupt_image(kind: str) -> ImageError:
+    """Returns the error for a file that begins like the format `kind` but can't be decoded."""
     return ImageError(f"the {kind} image is corrupt and can't be decoded", ACCEPTED)
 
 
 def _describe(data: bytes) -> str:
     if not data:
         return "it is empty"
-    return "its kind is unknown" if _BINARY.search(data[:64]) else "it looks like text"
+    return "its format is unknown" if _BINARY.search(data[:64]) else "it looks like text"
 
 
 def _number(data: bytes, start: int, size: int, *, big: bool = False) -> int:
+    """Returns an integer of `size` bytes. Raises IndexError if `data` ends before."""
     part = data[start : start + size]
     if len(part) < size:
         raise IndexError
@@ -110,23 +113,23 @@ def _number(data: bytes, start: int, size: int, *, big: bool = False) -> int:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """The size stands in the first frame segment, and a decoder refuses a second one."""
-    at = _walk_jpeg(data, _JPEG_SIZE_MARKERS)
+    """Reads the size from the first frame segment; decoders refuse a second one."""
+    at = _find_jpeg_marker(data, _JPEG_SIZE_MARKERS)
     return _number(data, at + 5, 2, big=True), _number(data, at + 3, 2, big=True)
 
 
 def _jpeg_body(data: bytes) -> bytes:
-    """All of the file up to its end marker: many cameras pad their files, some append a preview."""
-    return data[: _walk_jpeg(data, frozenset({_JPEG_END}))]
+    """Returns the file up to its end marker: many cameras pad their files, some append a preview."""
+    return data[: _find_jpeg_marker(data, frozenset({_JPEG_END}))]
 
 
-def _walk_jpeg(data: bytes, wanted: frozenset[int]) -> int:
-    """Goes from marker to marker as a decoder does; where the first of the `wanted` ones ends.
+def _find_jpeg_marker(data: bytes, wanted: frozenset[int]) -> int:
+    """Returns the offset after the first of the `wanted` markers, reading marker by marker as a decoder does.
 
-    Raises IndexError where none comes, and ImageError where no decoder would go on to it, or too long.
+    Raises IndexError if there is none, and ImageError if a decoder would stop before it or would take too long.
     """
     at, scans = 2, 0
-    for _ in range(_MOST_JPEG_SEGMENTS):
+    for _ in range(_MAX_JPEG_SEGMENTS):
         match = _JPEG_MARKER.search(data, at)
         if match is None:
             raise IndexError
@@ -134,33 +137,34 @@ def _walk_jpeg(data: bytes, wanted: frozenset[int]) -> int:
         if marker in wanted:
             return at
         if marker == _JPEG_END or _JPEG_TEMPORARY < marker < _JPEG_FIRST:
-            raise corrupt("JPEG")
+            raise corrupt_image("JPEG")
         scans += marker == _JPEG_START_OF_SCAN
-        if scans > _MOST_JPEG_SCANS:
-            raise ImageError(f"the JPEG image has more than {_MOST_JPEG_SCANS} scans", "save it as a baseline JPEG")
+        if scans > _MAX_JPEG_SCANS:
+            raise ImageError(f"the JPEG image has more than {_MAX_JPEG_SCANS} scans", "save it as a baseline JPEG")
         if marker != _JPEG_TEMPORARY:
             at += _number(data, at, 2, big=True)
-    raise ImageError(f"the JPEG image has more than {_MOST_JPEG_SEGMENTS:,} segments", "save it as a baseline JPEG")
+    raise ImageError(f"the JPEG image has more than {_MAX_JPEG_SEGMENTS:,} segments", "save it as a baseline JPEG")
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
-    """The size stands in IHDR, always the first chunk."""
+    """Reads the size from IHDR, which is always the first chunk."""
     if data[12:16] != b"IHDR":
-        raise corrupt("PNG")
+        raise corrupt_image("PNG")
     return _number(data, 16, 4, big=True), _number(data, 20, 4, big=True)
 
 
 def _png_body(data: bytes) -> bytes:
-    """The file without what is no pixels: texts and profiles may inflate a thousandfold, animations are ignored."""
+    """Returns the file without texts and profiles, which may inflate a thousandfold, and without animations."""
     view = memoryview(data)
-    kept, pixels = [view[:_PNG_CHUNKS_AT]], []
-    at, once = _PNG_CHUNKS_AT, set(_PNG_KEPT)
-    for _ in range(_MOST_PNG_CHUNKS):
+    kept, pixels = [view[:_PNG_FIRST_CHUNK]], []
+    # Each optional chunk is kept only the first time.
+    at, wanted = _PNG_FIRST_CHUNK, set(_PNG_KEPT)
+    for _ in range(_MAX_PNG_CHUNKS):
         kind, end = data[at + 4 : at + 8], at + 12 + _number(data, at, 4, big=True)
         if end > len(data):
             raise IndexError
-        if not kind[0] & _PNG_OPTIONAL or kind in once:
-            once.discard(kind)
+        if not kind[0] & _PNG_OPTIONAL or kind in wanted:
+            wanted.discard(kind)
             kept.append(view[at:end])
         if kind == b"IDAT":
             pixels.append(view[at + 8 : end - 4])
@@ -168,15 +172,15 @@ def _png_body(data: bytes) -> bytes:
             _check_inflated(data, pixels)
             return b"".join(kept)
         at = end
-    raise ImageError(f"the PNG image has more than {_MOST_PNG_CHUNKS:,} chunks", "save it with another program")
+    raise ImageError(f"the PNG image has more than {_MAX_PNG_CHUNKS:,} chunks", "save it with another program")
 
 
 def _check_inflated(data: bytes, pixels: list[memoryview]) -> None:
-    """Raises ImageError where the compressed `pixels` hold far more than the image that the header promises."""
+    """Raises ImageError if the compressed `pixels` hold far more data than an image of the header's size."""
     width, height = _png_size(data)
-    depth, colours = data[24], data[25]
-    # Twice as much as the pixels take, because the seven passes of an interlaced image each begin their rows anew.
-    left = 2 * height * (1 + width * _PNG_CHANNELS.get(colours, 4) * depth // 8) + _INFLATED_FOR_NOTHING
+    depth, colors = data[24], data[25]
+    # Twice the size of the pixels, because each of the seven passes of an interlaced image has rows of its own.
+    left = 2 * height * (1 + width * _PNG_CHANNELS.get(colors, 4) * depth // 8) + _MAX_EXCESS_BYTES
     if _DEFLATE_RATIO * sum(map(len, pixels)) <= left:
         return
     for size in _inflated(pixels):
@@ -186,7 +190,7 @@ def _check_inflated(data: bytes, pixels: list[memoryview]) -> None:
 
 
 def _inflated(parts: list[memoryview]) -> Iterator[int]:
-    """How many bytes are in a stream in `parts`, step by step."""
+    """Yields how many bytes each step of inflating a stream in `parts` gives."""
     inflater = zlib.decompressobj()
     for part in parts:
         rest: bytes | memoryview = part
@@ -194,17 +198,18 @@ def _inflated(parts: list[memoryview]) -> Iterator[int]:
             try:
                 yield len(inflater.decompress(rest, _INFLATE_STEP))
             except zlib.error:
-                raise corrupt("PNG") from None
+                raise corrupt_image("PNG") from None
             rest = inflater.unconsumed_tail
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
-    """The size stands in the first chunk, in one of three forms: lossy, lossless or extended.
+    """Reads the size from the first chunk, in one of three forms: lossy, lossless or extended.
 
-    An extended file's canvas is that of its one image, or holds all images of its animation: a decoder refuses others.
+    An extended file's size is that of its image, or of the area for all images of its animation. Decoders refuse files
+    with larger images.
     """
     if data[8:12] != b"WEBP":
-        raise ImageError("not an image: its kind is unknown", ACCEPTED)
+        raise ImageError("not an image: its format is unknown", ACCEPTED)
     chunk = data[12:16]
     if chunk == b"VP8 ":
         return _number(data, 26, 2) & 0x3FFF, _number(data, 28, 2) & 0x3FFF
@@ -213,11 +218,11 @@ def _webp_size(data: bytes) -> tuple[int, int]:
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     if chunk == b"VP8X":
         return _number(data, 24, 3) + 1, _number(data, 27, 3) + 1
-    raise corrupt("WebP")
+    raise corrupt_image("WebP")
 
 
 def _webp_body(data: bytes) -> bytes:
-    """All of the file up to the length that its beginning tells."""
+    """Returns the file up to the length in its header."""
     end = _number(data, 4, 4) + 8
     if end > len(data):
         raise IndexError
@@ -225,7 +230,7 @@ def _webp_body(data: bytes) -> bytes:
 
 
 _FORMATS: Final = (
-    Format("JPEG", b"\xff\xd8\xff", _jpeg_size, _jpeg_body),
-    Format("PNG", b"\x89PNG\r\n\x1a\n", _png_size, _png_body),
-    Format("WebP", b"RIFF", _webp_size, _webp_body),
+    ImageFormat("JPEG", b"\xff\xd8\xff", _jpeg_size, _jpeg_body),
+    ImageFormat("PNG", b"\x89PNG\r\n\x1a\n", _png_size, _png_body),
+    ImageFormat("WebP", b"RIFF", _webp_size, _webp_body),
 )

@@ -17,7 +17,7 @@ from lanestream.errors import ModelError, ProviderError, one_line
 from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import METADATA_KEY, ModelInfo, parse_info, require_file
 from lanestream.inference.providers import DEFAULT_OPTIONS, OPENVINO, ProviderSpec, RuntimeOptions
-from lanestream.processors import processors
+from lanestream.host import processors
 
 # A new batch size costs OpenVINO a few milliseconds once, and every size costs the same per input.
 _BATCH_SIZES: Final = tuple(range(1, 9))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import ProviderError
-from lanestream.processors import instructions
+from lanestream.host import instruction_sets
 
 if TYPE_CHECKING:
     from lanestream.inference.loaded_model import LoadedModel
@@ -54,7 +54,7 @@ class Installed:
         return cls(
             onnxruntime=frozenset(import_module("onnxruntime").get_available_providers()),
             openvino=find_spec("openvino") is not None,
-            amx="amx_int8" in instructions(),
+            amx="amx_int8" in instruction_sets(),
         )
 
     def without_gpus(self) -> Installed:

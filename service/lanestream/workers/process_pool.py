@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import LanestreamError, WorkerLostError
 from lanestream.inference.providers import PROVIDERS
-from lanestream.memory import memory_limit
-from lanestream.processors import processors
+from lanestream.host import memory_limit
+from lanestream.host import processors
 from lanestream.session import SessionState
 from lanestream.tracking.tracker import LaneTracker
 from lanestream.workers.capabilities import Capabilities

@@ -1,4 +1,4 @@
-"""The compose file, and what it gives Prometheus and Grafana, without an engine to run them."""
+"""The compose file and the files for Prometheus and Grafana, checked without a container engine."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text())
 DASHBOARD: dict[str, Any] = json.loads((DOCKER / "grafana/dashboards/lanestream.json").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
-OURS = ("lanestream", "lanestream-gpu")
+OWN_SERVICES = ("lanestream", "lanestream-gpu")
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_every_container_is_guarded(name: str) -> None:
+def test_every_container_is_hardened(name: str) -> None:
     service = SERVICES[name]
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
@@ -39,22 +39,22 @@ def test_every_container_is_guarded(name: str) -> None:
     assert service["restart"] == "unless-stopped"
     assert service["deploy"]["resources"]["limits"].keys() == {"memory", "pids"}
     assert "privileged" not in service
-    # Ours are checked by the image itself.
-    assert name in OURS or "test" in service["healthcheck"]
+    # Our own image has a health check.
+    assert name in OWN_SERVICES or "test" in service["healthcheck"]
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_ports_are_open_to_this_machine_alone_unless_asked(name: str) -> None:
+def test_ports_are_published_on_this_machine_only_by_default(name: str) -> None:
     for port in SERVICES[name].get("ports", []):
         assert re.fullmatch(r"\$\{[A-Z_]+:-127\.0\.0\.1:\d+\}:\d+", port)
 
 
-@pytest.mark.parametrize("name", set(SERVICES) - set(OURS))
-def test_images_of_others_are_pinned(name: str) -> None:
+@pytest.mark.parametrize("name", set(SERVICES) - set(OWN_SERVICES))
+def test_third_party_images_are_pinned(name: str) -> None:
     assert re.search(r":v?\d", SERVICES[name]["image"])
 
 
-def test_a_profile_starts_one_variant_with_all_that_it_needs() -> None:
+def test_a_profile_starts_one_variant_and_all_its_dependencies() -> None:
     for variant, own in (("cpu", "lanestream"), ("gpu", "lanestream-gpu")):
         started = {name for name, service in SERVICES.items() if variant in service["profiles"]}
         assert started == {own, "redis", "prometheus", "grafana"}
@@ -62,51 +62,51 @@ def test_a_profile_starts_one_variant_with_all_that_it_needs() -> None:
     assert SERVICES["lanestream-gpu"]["deploy"]["resources"]["reservations"]["devices"][0]["capabilities"] == ["gpu"]
 
 
-@pytest.mark.parametrize("name", OURS)
-def test_the_service_is_told_settings_that_it_has(name: str) -> None:
+@pytest.mark.parametrize("name", OWN_SERVICES)
+def test_the_environment_contains_only_known_settings(name: str) -> None:
     given = {key.removeprefix("LANESTREAM_").lower() for key in SERVICES[name]["environment"]}
     assert given <= set(Settings.model_fields)
 
 
-@pytest.mark.parametrize("name", OURS)
-def test_a_container_is_given_longer_to_stop_than_it_drains(name: str) -> None:
+@pytest.mark.parametrize("name", OWN_SERVICES)
+def test_the_grace_period_is_longer_than_draining(name: str) -> None:
     grace = float(SERVICES[name]["stop_grace_period"].removesuffix("s"))
     assert grace >= Settings().drain_s + 10
 
 
-def test_secrets_and_mounts_come_from_files_that_are_not_committed_or_are_there() -> None:
+def test_secrets_are_not_committed_and_mounts_exist() -> None:
     ignored = (ROOT / ".gitignore").read_text().split()
     assert "docker/secrets/" in ignored
     assert all(secret["file"].startswith("secrets/") for secret in COMPOSE["secrets"].values())
     for service in SERVICES.values():
         assert set(service.get("secrets", [])) <= set(COMPOSE["secrets"])
-        told = " ".join(map(str, service.get("environment", {}).values()))
-        assert set(re.findall(r"/run/secrets/(\w+)", told)) <= set(service.get("secrets", []))
+        environment = " ".join(map(str, service.get("environment", {}).values()))
+        assert set(re.findall(r"/run/secrets/(\w+)", environment)) <= set(service.get("secrets", []))
         for mount in service.get("volumes", []):
             source = mount.split(":")[0]
             assert (DOCKER / source).exists() if source.startswith(".") else source in COMPOSE["volumes"]
 
 
-def test_prometheus_asks_by_the_name_that_the_replicas_answer_to() -> None:
+def test_prometheus_finds_replicas_by_their_alias() -> None:
     (job,) = yaml.safe_load((DOCKER / "prometheus/prometheus.yaml").read_text())["scrape_configs"]
-    (asked,) = job["dns_sd_configs"]
-    for name in OURS:
-        assert asked["names"] == SERVICES[name]["networks"]["metrics"]["aliases"]
-        assert str(asked["port"]) == SERVICES[name]["environment"]["LANESTREAM_PORT"]
+    (lookup,) = job["dns_sd_configs"]
+    for name in OWN_SERVICES:
+        assert lookup["names"] == SERVICES[name]["networks"]["metrics"]["aliases"]
+        assert str(lookup["port"]) == SERVICES[name]["environment"]["LANESTREAM_PORT"]
     assert job["job_name"] == "lanestream"
     assert Path(job["authorization"]["credentials_file"]).name in SERVICES["prometheus"]["secrets"]
 
 
-def test_secrets_are_made_once_and_open_the_service(tmp_path: Path) -> None:
+def test_secrets_are_created_once_and_are_valid_keys(tmp_path: Path) -> None:
     script = shutil.copy(DOCKER / "make-secrets", tmp_path)
     secrets = tmp_path / "secrets"
 
-    def made() -> dict[str, str]:
+    def run_script() -> dict[str, str]:
         subprocess.run([script, sys.executable, "-m", "lanestream.cli"], check=True, capture_output=True)
         return {path.name: path.read_text().strip() for path in secrets.iterdir()}
 
-    first = made()
-    assert made() == first
+    first = run_script()
+    assert run_script() == first
     keys = read_keys(secrets / "api_keys")
     for name in ("local", "prometheus"):
         key = find(keys, first[f"{name}_key"])
@@ -119,14 +119,14 @@ def test_secrets_are_made_once_and_open_the_service(tmp_path: Path) -> None:
 
 
 def expressions() -> Iterator[str]:
-    """Every query of the dashboard and of the alerts."""
+    """Yields every query of the dashboard and of the alerts."""
     yield from (target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", []))
     (group,) = yaml.safe_load((DOCKER / "prometheus/alerts.yaml").read_text())["groups"]
     yield from (rule["expr"] for rule in group["rules"])
 
 
 def exposition() -> str:
-    """What a service tells that everything has happened to once."""
+    """Returns the metrics of a service in which everything has happened once."""
     metrics = Metrics()
     for offer in Capabilities.of(fakes.engine().pipelines).all:
         metrics.loaded(offer)
@@ -139,28 +139,28 @@ def exposition() -> str:
 
 
 def series() -> dict[str, set[str]]:
-    """The labels of each series that Prometheus has of a service, by name."""
-    there = {"up": set[str]()}
+    """Returns the labels of every series that Prometheus has of a service, by name."""
+    labels_by_name = {"up": set[str]()}
     for family in text_string_to_metric_families(exposition()):
         for sample in family.samples:
-            there.setdefault(sample.name, set()).update(sample.labels)
-    return {name: labels | {"job", "instance"} for name, labels in there.items()}
+            labels_by_name.setdefault(sample.name, set()).update(sample.labels)
+    return {name: labels | {"job", "instance"} for name, labels in labels_by_name.items()}
 
 
 @pytest.mark.parametrize("expression", sorted(set(expressions())))
-def test_queries_ask_for_series_and_labels_that_there_are(expression: str) -> None:
-    there = series()
-    asked = set(re.findall(r"\b(lane_\w+|process_\w+|up)(?=[{\[ ]|$)", expression))
-    assert asked
-    assert asked <= set(there)
+def test_queries_use_existing_series_and_labels(expression: str) -> None:
+    existing = series()
+    used = set(re.findall(r"\b(lane_\w+|process_\w+|up)(?=[{\[ ]|$)", expression))
+    assert used
+    assert used <= set(existing)
     labels = {name for group in re.findall(r"by \(([^)]*)\)", expression) for name in group.split(", ")}
     labels |= set(re.findall(r'(\w+)(?:=~|!=|!~|=)"', expression))
-    assert all(labels <= there[name] for name in asked)
+    assert all(labels <= existing[name] for name in used)
     reasons = {reason for group in re.findall(r'reason=~?"([^"]*)"', expression) for reason in group.split("|")}
     assert reasons <= set(get_args(DropReason))
 
 
-def test_the_dashboard_shows_every_metric_of_ours() -> None:
+def test_the_dashboard_shows_all_our_metrics() -> None:
     shown = " ".join(expressions())
     for family in text_string_to_metric_families(exposition()):
         assert not family.name.startswith("lane_") or family.name.endswith("_created") or family.name in shown
@@ -169,17 +169,17 @@ def test_the_dashboard_shows_every_metric_of_ours() -> None:
 def test_panels_are_described_and_do_not_overlap() -> None:
     panels = DASHBOARD["panels"]
     assert len({panel["id"] for panel in panels}) == len(panels)
-    taken: set[tuple[int, int]] = set()
+    occupied: set[tuple[int, int]] = set()
     for panel in panels:
-        place = panel["gridPos"]
-        cells = {(place["x"] + x, place["y"] + y) for x in range(place["w"]) for y in range(place["h"])}
-        assert not cells & taken
+        grid = panel["gridPos"]
+        cells = {(grid["x"] + x, grid["y"] + y) for x in range(grid["w"]) for y in range(grid["h"])}
+        assert not cells & occupied
         assert max(x for x, _ in cells) < 24
-        taken |= cells
+        occupied |= cells
         assert panel["type"] == "row" or (panel["title"] and panel["description"] and panel["targets"])
 
 
-def test_the_dashboard_is_provisioned_from_where_it_is_mounted() -> None:
+def test_the_dashboard_is_provisioned_from_its_mount() -> None:
     provider = yaml.safe_load((DOCKER / "grafana/provisioning/dashboards/lanestream.yaml").read_text())["providers"][0]
     targets = [mount.split(":")[1] for mount in SERVICES["grafana"]["volumes"]]
     assert provider["options"]["path"] in targets

@@ -1,4 +1,4 @@
-"""What can be known of the image without an engine to build it."""
+"""The files of the container image, checked without a container engine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DOCKER = ROOT / "docker"
 
 
 def script(name: str) -> ModuleType:
-    """A script of docker/, which is no package."""
+    """Imports a script of docker/, which is not a package."""
     spec = importlib.util.spec_from_file_location(name, DOCKER / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -28,7 +28,7 @@ def script(name: str) -> ModuleType:
 
 
 def instructions() -> list[tuple[str, str]]:
-    """The Dockerfile's instructions in order, each with what follows it, continued lines joined."""
+    """Returns the Dockerfile's instructions in order, each with its arguments, with continued lines joined."""
     text = (DOCKER / "Dockerfile").read_text().replace("\\\n", " ")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     return [(name, " ".join(rest.split())) for name, _, rest in (line.partition(" ") for line in lines)]
@@ -38,7 +38,7 @@ def values(instruction: str) -> list[str]:
     return [rest for name, rest in instructions() if name == instruction]
 
 
-def test_the_image_has_a_cpu_and_a_gpu_target_on_a_base_of_choice() -> None:
+def test_the_image_has_a_cpu_and_a_gpu_target_and_a_configurable_base() -> None:
     assert instructions()[0][0] == "ARG"
     assert instructions()[0][1].startswith("BASE_IMAGE=")
     stages = {rest.split()[-1]: rest.split()[0] for rest in values("FROM")}
@@ -46,18 +46,18 @@ def test_the_image_has_a_cpu_and_a_gpu_target_on_a_base_of_choice() -> None:
     assert stages["runtime"] == stages["builder"] == "${BASE_IMAGE}"
 
 
-def test_the_image_runs_as_a_numbered_user_that_is_not_root() -> None:
+def test_the_image_runs_as_a_numbered_non_root_user() -> None:
     (user,) = values("USER")
     assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", user)
 
 
 @pytest.mark.parametrize("instruction", ["ENTRYPOINT", "CMD", "HEALTHCHECK"])
-def test_signals_reach_the_service_because_no_shell_is_in_between(instruction: str) -> None:
+def test_commands_run_without_a_shell_so_that_signals_reach_them(instruction: str) -> None:
     (value,) = values(instruction)
     assert isinstance(json.loads(value[value.index("[") :]), list)
 
 
-def test_what_the_image_is_built_from_is_there_and_not_ignored() -> None:
+def test_copied_files_exist_and_are_not_ignored() -> None:
     ignored = (ROOT / ".dockerignore").read_text().split()
     for rest in values("COPY"):
         if rest.startswith("--from"):
@@ -78,15 +78,15 @@ def test_the_image_needs_one_runtime_and_no_torch(runtime: str) -> None:
     assert {"fastapi", "uvicorn", "pydantic"} <= set(names)
 
 
-def test_an_extra_that_is_not_there_is_told() -> None:
+def test_an_unknown_extra_is_an_error() -> None:
     with pytest.raises(KeyError, match="warp"):
         script("dependencies").requirements(ROOT / "pyproject.toml", ["warp"])
 
 
-def test_what_is_never_imported_is_taken_out(tmp_path: Path) -> None:
-    gone = ["numpy/tests/test_x.py", "scipy/stats/tests/data/y.npy", "openvino/libs/libopenvino_intel_gpu_plugin.so"]
+def test_unused_files_are_removed(tmp_path: Path) -> None:
+    removed = ["numpy/tests/test_x.py", "scipy/stats/tests/data/y.npy", "openvino/libs/libopenvino_intel_gpu_plugin.so"]
     kept = ["numpy/testing/__init__.py", "numpy/core.py", "openvino/libs/libopenvino_intel_cpu_plugin.so"]
-    for name in [*gone, *kept]:
+    for name in [*removed, *kept]:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     script("dependencies").prune(tmp_path)
@@ -94,14 +94,14 @@ def test_what_is_never_imported_is_taken_out(tmp_path: Path) -> None:
     assert sorted(left) == sorted(kept)
 
 
-def test_the_version_of_python_is_one_that_the_product_supports() -> None:
+def test_the_base_image_has_a_supported_python() -> None:
     supported = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"].removeprefix(">=")
     base = re.search(r"python:(\d+)\.(\d+)", values("ARG")[0])
     assert base is not None
     assert tuple(map(int, base.groups())) >= tuple(map(int, supported.split(".")))
 
 
-def test_what_the_page_about_deployment_points_to_is_there() -> None:
+def test_links_targets_and_settings_in_the_deployment_page_exist() -> None:
     page = ROOT / "docs/deployment.md"
     text = page.read_text()
     for target in re.findall(r"\]\(([^)#]+)\)", text):

@@ -1,4 +1,4 @@
-"""A container's first process is deaf to signals without a handler: SIGTERM would wait for the end of the imports."""
+"""SIGTERM during the start. A container's first process ignores signals without a handler, so it needs one early."""
 
 from __future__ import annotations
 
@@ -18,6 +18,6 @@ cli.main()
 
 
 @pytest.mark.parametrize(("number", "code"), [(1, 143), (77, -signal.SIGTERM)])
-def test_sigterm_ends_what_still_starts_as_the_first_process_too(number: int, code: int) -> None:
-    done = subprocess.run([sys.executable, "-c", COMMAND.format(number=number)], check=False)
-    assert done.returncode == code
+def test_sigterm_ends_a_starting_process_also_as_process_1(number: int, code: int) -> None:
+    result = subprocess.run([sys.executable, "-c", COMMAND.format(number=number)], check=False)
+    assert result.returncode == code

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanestream.images.decoding import Picture
+from lanestream.images.decoding import DecodedImage
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.protocol import LanesMessage, parse_server_message
 from lanestream.road.curve import Curve, curve_basis
@@ -49,7 +49,7 @@ def test_all_fields_are_told() -> None:
 def test_lanes_of_a_reduced_picture_are_told_in_pixels_of_its_file() -> None:
     lane = boundary(Curve(100.0, (300.0, -1.25, 500.0)), 120.0, 359.0)
     result = FrameResult((lane,), EgoLane(5, None), 100.0)
-    picture = Picture(np.zeros((360, 640, 3), np.uint8), reduced=2)
+    picture = DecodedImage(np.zeros((360, 640, 3), np.uint8), reduction=2)
     frame = ProcessedFrame.of(picture, result, dict.fromkeys(STAGES, 1.0))
     (moved,) = frame.result.lanes
     assert (frame.size, frame.result.horizon, moved.top, moved.bottom) == ((1280, 720), 200.5, 240.5, 718.5)

@@ -7,7 +7,7 @@ import pytest
 from lanestream import errors
 from lanestream.api.content_negotiation import preferred
 from lanestream.errors import LanestreamError, MissingExtraError, SettingsError, answer_to, error_of, needs_extra
-from lanestream.processors import processors
+from lanestream.host import processors
 from lanestream.protocol import error_message, schemas
 from lanestream.settings import Settings, load_settings
 

@@ -1,4 +1,4 @@
-"""What is taken for an image, and what is said of everything else."""
+"""Which files are decoded, and the errors for all others."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KINDS = {".jpg": "JPEG", ".png": "PNG", ".webp": "WebP"}
 
 
 def png(width: int, height: int) -> bytes:
-    """A PNG that claims a size; its pixels are never looked at."""
+    """A PNG with a size in its header and without pixels."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -28,21 +28,21 @@ def png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
 
 
-def refused(data: bytes, limits: ImageLimits = LIMITS) -> str:
+def error_of(data: bytes, limits: ImageLimits = LIMITS) -> str:
     with pytest.raises(ImageError) as caught:
         decode(data, limits)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def told(header: Header) -> tuple[str, int, int]:
+def summary(header: Header) -> tuple[str, int, int]:
     return header.kind, header.width, header.height
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_accepted_kinds_are_decoded(kind: str) -> None:
+def test_the_accepted_formats_are_decoded(kind: str) -> None:
     data = fakes.image_file(kind)
-    assert told(read_header(data)) == (KINDS[kind], 320, 180)
+    assert summary(read_header(data)) == (KINDS[kind], 320, 180)
     image = decode(data, LIMITS)
     assert image.shape == (180, 320, 3)
     assert abs(int(image[90, 0, 0]) - 30) <= 3
@@ -50,7 +50,7 @@ def test_the_accepted_kinds_are_decoded(kind: str) -> None:
 
 
 @pytest.mark.parametrize("options", ["progressive", "restarts", "lossy"])
-def test_other_ways_to_write_them_are_understood(options: str) -> None:
+def test_variants_of_the_formats_are_decoded(options: str) -> None:
     import cv2
     import numpy as np
 
@@ -61,26 +61,26 @@ def test_other_ways_to_write_them_are_understood(options: str) -> None:
         "lossy": (".webp", [cv2.IMWRITE_WEBP_QUALITY, 60]),
     }[options]
     data = cv2.imencode(kind, image, flags)[1].tobytes()
-    assert told(read_header(data)) == (KINDS[kind], 130, 100)
+    assert summary(read_header(data)) == (KINDS[kind], 130, 100)
     assert decode(data, LIMITS).shape == (100, 130, 3)
 
 
-def test_an_extended_webp_tells_its_canvas() -> None:
-    canvas = (1280 - 1).to_bytes(3, "little") + (720 - 1).to_bytes(3, "little")
-    data = b"RIFF" + (22).to_bytes(4, "little") + b"WEBPVP8X" + (10).to_bytes(4, "little") + bytes(4) + canvas
-    assert told(read_header(data)) == ("WebP", 1280, 720)
+def test_the_size_of_an_extended_webp_is_read() -> None:
+    size = (1280 - 1).to_bytes(3, "little") + (720 - 1).to_bytes(3, "little")
+    data = b"RIFF" + (22).to_bytes(4, "little") + b"WEBPVP8X" + (10).to_bytes(4, "little") + bytes(4) + size
+    assert summary(read_header(data)) == ("WebP", 1280, 720)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_file_that_is_cut_short_anywhere_is_refused(kind: str) -> None:
+def test_a_truncated_file_is_refused(kind: str) -> None:
     data = fakes.image_file(kind)
     for size in {*range(12, 60), *range(60, len(data) - 12, 41)}:
-        with pytest.raises(ImageError, match=r"cut short|corrupt|kind is unknown"):
+        with pytest.raises(ImageError, match=r"cut short|corrupt|format is unknown"):
             decode(data[:size], LIMITS)
-    assert "its end is missing" in refused(data[:-13])
+    assert "its end is missing" in error_of(data[:-13])
 
 
-def test_what_a_camera_adds_after_the_end_is_ignored() -> None:
+def test_bytes_after_the_end_are_ignored() -> None:
     assert decode(fakes.image_file() + bytes(500), LIMITS).shape == (180, 320, 3)
 
 
@@ -89,7 +89,7 @@ def test_an_end_marker_in_a_preview_is_not_the_end() -> None:
     preview = b"\xff\xe1" + struct.pack(">H", 2 + len(data)) + data
     whole = data[:2] + preview + data[2:]
     assert decode(whole, LIMITS).shape == (180, 320, 3)
-    assert "cut short" in refused(whole[: 2 + len(preview) + 300])
+    assert "cut short" in error_of(whole[: 2 + len(preview) + 300])
 
 
 @pytest.mark.parametrize(
@@ -103,8 +103,8 @@ def test_an_end_marker_in_a_preview_is_not_the_end() -> None:
         fakes.image_file(".webp")[:40] + bytes(len(fakes.image_file(".webp")) - 40),
     ],
 )
-def test_corrupt_files_are_told_as_that(data: bytes) -> None:
-    assert "is corrupt" in refused(data)
+def test_corrupt_files_are_reported_as_corrupt(data: bytes) -> None:
+    assert "is corrupt" in error_of(data)
 
 
 @pytest.mark.parametrize(
@@ -114,18 +114,18 @@ def test_corrupt_files_are_told_as_that(data: bytes) -> None:
         (b"hello\n", "it looks like text"),
         ("größe".encode(), "it looks like text"),
         (b'{"type": "frame"}', "it looks like text"),
-        (b"\x00\x00\x00\x1cftypheic", "its kind is unknown"),
-        (b"GIF89a\x01\x00\x01\x00", "its kind is unknown"),
-        (b"RIFF\x00\x00\x00\x00WAVE", "its kind is unknown"),
+        (b"\x00\x00\x00\x1cftypheic", "its format is unknown"),
+        (b"GIF89a\x01\x00\x01\x00", "its format is unknown"),
+        (b"RIFF\x00\x00\x00\x00WAVE", "its format is unknown"),
     ],
 )
-def test_what_is_no_image_is_told_what_is_accepted(data: bytes, why: str) -> None:
-    assert refused(data) == f"not an image: {why} (JPEG, PNG or WebP are accepted)"
+def test_the_error_for_other_files_names_the_accepted_formats(data: bytes, why: str) -> None:
+    assert error_of(data) == f"not an image: {why} (JPEG, PNG or WebP are accepted)"
 
 
 def test_sizes_are_checked_before_anything_is_decoded() -> None:
-    assert "1 x 1" in refused(png(1, 1))
-    assert "63 x 5000" in refused(png(63, 5000))
+    assert "1 x 1" in error_of(png(1, 1))
+    assert "63 x 5000" in error_of(png(63, 5000))
     with pytest.raises(ImageTooLargeError, match="30000 x 30000, 900,000,000 pixels; at most 9,437,184"):
         decode(png(30_000, 30_000), LIMITS)
     with pytest.raises(ImageTooLargeError, match="1,001 bytes; at most 1,000"):
@@ -133,48 +133,48 @@ def test_sizes_are_checked_before_anything_is_decoded() -> None:
 
 
 @pytest.mark.parametrize(("width", "height"), [(320, 180), (3840, 2160), (4096, 2160), (64, 64)])
-def test_the_sizes_that_are_promised_are_accepted(width: int, height: int) -> None:
+def test_the_documented_sizes_are_accepted(width: int, height: int) -> None:
     assert decode(fakes.image_file(".jpg", width, height), LIMITS).shape == (height, width, 3)
 
 
-def test_a_jpeg_with_endless_scans_is_refused() -> None:
+def test_a_jpeg_with_too_many_scans_is_refused() -> None:
     data = fakes.image_file()
     scan = b"\xff\xda" + struct.pack(">H", 8) + bytes(6)
-    assert "more than 100 scans" in refused(data[:-2] + 101 * scan + data[-2:])
+    assert "more than 100 scans" in error_of(data[:-2] + 101 * scan + data[-2:])
 
 
-def turned(data: bytes) -> bytes:
-    """A JPEG file with the note that its camera was held upright."""
+def rotated(data: bytes) -> bytes:
+    """A JPEG file with the EXIF orientation of a camera that was rotated by 90 degrees."""
     tags = b"Exif\x00\x00MM\x00*" + struct.pack(">IH", 8, 1) + struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0) + bytes(4)
     return data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(tags)) + tags + data[2:]
 
 
-def test_pictures_are_turned_upright() -> None:
-    assert decode(turned(fakes.image_file()), LIMITS).shape == (320, 180, 3)
+def test_the_exif_orientation_is_applied() -> None:
+    assert decode(rotated(fakes.image_file()), LIMITS).shape == (320, 180, 3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
-    ("size", "reduced"),
+    ("size", "reduction"),
     [((1280, 720), 2), ((1278, 720), 1), ((2560, 1440), 4), ((1920, 1080), 2), ((1282, 721), 1), ((320, 180), 1)],
 )
-def test_large_images_are_reduced_where_their_sides_divide(kind: str, size: tuple[int, int], reduced: int) -> None:
-    picture = decode_reduced(fakes.image_file(kind, *size), LIMITS, 640)
-    assert (picture.size, picture.reduced) == (size, reduced)
-    assert picture.image.shape == (size[1] // reduced, size[0] // reduced, 3)
+def test_large_images_are_reduced_if_their_sides_divide(kind: str, size: tuple[int, int], reduction: int) -> None:
+    decoded = decode_reduced(fakes.image_file(kind, *size), LIMITS, 640)
+    assert (decoded.size, decoded.reduction) == (size, reduction)
+    assert decoded.image.shape == (size[1] // reduction, size[0] // reduction, 3)
 
 
-def test_a_reduced_image_is_its_mean_and_a_turned_one_stays_whole() -> None:
+def test_a_reduced_image_is_averaged_and_a_rotated_one_is_not_reduced() -> None:
     import cv2
 
     data = fakes.image_file(".jpg", 1280, 720)
     halves = cv2.resize(decode(data, LIMITS), (640, 360), interpolation=cv2.INTER_AREA)
     assert cv2.norm(decode_reduced(data, LIMITS, 640).image, halves, cv2.NORM_INF) <= 3
-    picture = decode_reduced(turned(data), LIMITS, 640)
-    assert (picture.size, picture.reduced) == ((720, 1280), 1)
+    decoded = decode_reduced(rotated(data), LIMITS, 640)
+    assert (decoded.size, decoded.reduction) == ((720, 1280), 1)
 
 
-def test_reducing_refuses_what_decoding_refuses() -> None:
+def test_decode_reduced_refuses_the_same_files() -> None:
     data = fakes.image_file(".jpg", 1280, 720)
     with pytest.raises(ImageError, match="JPEG"):
         decode_reduced(data[: len(data) // 2], LIMITS, 640)
@@ -182,16 +182,16 @@ def test_reducing_refuses_what_decoding_refuses() -> None:
         decode_reduced(data, ImageLimits(max_pixels=640 * 360), 640)
 
 
-def test_the_second_wall_stands_before_opencv_is_imported() -> None:
+def test_opencvs_own_limit_is_set_before_it_is_imported() -> None:
     script = (
         "import lanestream.images.decoding, cv2, numpy, sys; data = sys.stdin.buffer.read();"
         "cv2.imdecode(numpy.frombuffer(data, 'u1'), 1)"
     )
-    done = subprocess.run([sys.executable, "-c", script], input=png(30_000, 30_000), capture_output=True, check=False)
-    assert b"CV_IO_MAX_IMAGE_PIXELS" in done.stderr or b"pixels <=" in done.stderr
+    result = subprocess.run([sys.executable, "-c", script], input=png(30_000, 30_000), capture_output=True, check=False)
+    assert b"CV_IO_MAX_IMAGE_PIXELS" in result.stderr or b"pixels <=" in result.stderr
 
 
-def test_an_elongated_image_is_refused_before_it_is_decoded() -> None:
+def test_an_elongated_image_is_refused() -> None:
     for width, height in ((64, 321), (321, 64)):
         with pytest.raises(ImageError, match="too elongated"):
             decode(fakes.image_file(".png", width, height), ImageLimits())

@@ -1,4 +1,4 @@
-"""Image files that were damaged at random: each is an image within the limits, or one line that says why not."""
+"""Randomly damaged image files: each is an image within the limits, or an error in one line."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ FILES = {
 
 @st.composite
 def damage(draw: st.DrawFn, data: bytes) -> bytes:
-    """Some bytes of `data` replaced, taken out, put in twice or taken from other files; headers are hit most often."""
+    """Draws `data` with bytes replaced, removed, duplicated or taken from other files, mostly in the header."""
     for _ in range(draw(st.integers(1, 4))):
         reach = min(len(data), draw(st.sampled_from([40, 200, 100_000])))
         start = draw(st.integers(0, reach))
         end = start + draw(st.integers(0, 30))
         other = FILES[draw(st.sampled_from(sorted(FILES)))]
-        put = draw(
+        inserted = draw(
             st.one_of(
                 st.binary(max_size=8),
                 st.just(data[start:end] * 2),
@@ -39,14 +39,14 @@ def damage(draw: st.DrawFn, data: bytes) -> bytes:
                 st.integers(0, len(other)).map(lambda at, other=other: other[at : at + 60]),  # type: ignore[misc]
             )
         )
-        data = data[:start] + put + data[end:]
+        data = data[:start] + inserted + data[end:]
     return bombs.with_checksums(data) if draw(st.booleans()) else data
 
 
 @pytest.mark.parametrize("kind", FILES)
 @given(data=st.data())
 @settings(max_examples=150, derandomize=True, deadline=None)
-def test_a_damaged_file_is_an_image_or_one_line(kind: str, data: st.DataObject) -> None:
+def test_a_damaged_file_is_an_image_or_an_error_in_one_line(kind: str, data: st.DataObject) -> None:
     damaged = data.draw(damage(FILES[kind]))
     try:
         image = decode(damaged, LIMITS)

@@ -164,7 +164,7 @@ async def test_a_deadline_holds_in_the_worker_too() -> None:
     ("load", "told"),
     [
         (loading.missing, "no model file at x"),
-        (loading.broken, "OSError: no such luck"),
+        (loading.broken, "OSError: the disk is broken"),
         (loading.silent, "ended while it started: 3"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a machine has to run networks with, told by stand-ins for tools and libraries that are not here."""
+"""GPU devices and library versions, read from fakes of the tool and the libraries."""
 
 import ctypes
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from lanestream import machine
+from lanestream import gpu
 
 
 def writes(number: int) -> Any:
-    """A function of CUDA's kind: the version goes to where its argument points."""
+    """Returns a function like CUDA's, which writes the version to where its argument points."""
 
     def function(target: Any) -> int:
         ctypes.cast(target, ctypes.POINTER(ctypes.c_int))[0] = number
@@ -20,8 +20,8 @@ def writes(number: int) -> Any:
     return function
 
 
-def library_of(names: tuple[str, ...]) -> Any:
-    """A loader that has the libraries `names`, all of them with every function."""
+def loader(names: tuple[str, ...]) -> Any:
+    """Returns a function that loads the libraries `names`, each of which has every function."""
 
     def load(name: str) -> Any:
         if name not in names:
@@ -35,8 +35,8 @@ def library_of(names: tuple[str, ...]) -> Any:
     return load
 
 
-class Function:
-    """Stands in for a function of a C library, whose type of result can be set."""
+class CFunction:
+    """A fake function of a C library, whose result type can be set."""
 
     restype: Any = None
 
@@ -45,27 +45,27 @@ class Function:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "ask", "version"),
+    ("installed", "read", "version"),
     [
-        ("libcuda.so.1", machine._driver_cuda, "13.2"),
-        ("libcudart.so.12", machine._cuda, "13.0"),
-        ("libnvinfer.so.10", machine._tensorrt, "10.14.1"),
+        ("libcuda.so.1", gpu._driver_cuda_version, "13.2"),
+        ("libcudart.so.12", gpu._cuda_version, "13.0"),
+        ("libnvinfer.so.10", gpu._tensorrt_version, "10.14.1"),
     ],
 )
-def test_versions_are_read_as_their_libraries_tell_them(wanted: str, ask: Any, version: str) -> None:
-    names = ("libnone.so.9", wanted)
-    assert machine.version_of(names, ask, library_of((wanted,))) == version
-    assert machine.version_of(names, ask, library_of(())) is None
+def test_the_first_installed_library_gives_the_version(installed: str, read: Any, version: str) -> None:
+    names = ("libnone.so.9", installed)
+    assert gpu.library_version(names, read, loader((installed,))) == version
+    assert gpu.library_version(names, read, loader(())) is None
 
 
-def test_the_version_of_cudnn_is_a_size() -> None:
-    library = SimpleNamespace(cudnnGetVersion=Function())
-    assert machine.version_of(("libcudnn.so.9",), machine._cudnn, lambda _: library) == "9.13.2"
+def test_the_cudnn_version_is_read_as_a_size() -> None:
+    library = SimpleNamespace(cudnnGetVersion=CFunction())
+    assert gpu.library_version(("libcudnn.so.9",), gpu._cudnn_version, lambda _: library) == "9.13.2"
     assert library.cudnnGetVersion.restype is ctypes.c_size_t
 
 
-def test_a_library_without_the_function_is_none() -> None:
-    assert machine.version_of(("libc.so.6",), machine._driver_cuda) is None
+def test_a_library_without_the_function_has_no_version() -> None:
+    assert gpu.library_version(("libc.so.6",), gpu._driver_cuda_version) is None
 
 
 @pytest.mark.parametrize(
@@ -80,19 +80,12 @@ def test_a_library_without_the_function_is_none() -> None:
         ("echo 'NVIDIA-SMI has failed because it could not talk to the driver'; exit 9", (), None),
     ],
 )
-def test_devices_are_those_that_nvidia_smi_tells(
+def test_devices_and_driver_come_from_nvidia_smi(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, devices: tuple[str, ...], driver: str | None
 ) -> None:
     tool = tmp_path / "nvidia-smi"
     tool.write_text(f"#!/bin/sh\n{script}\n")
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    found = machine.gpu()
+    found = gpu.gpu()
     assert (found.devices, found.driver) == (devices, driver)
-
-
-def test_the_cpu_is_this_one() -> None:
-    cpu = machine.cpu()
-    assert cpu.name
-    assert 1 <= cpu.used <= cpu.affinity
-    assert len(set(cpu.flags)) == len(cpu.flags)

@@ -1,9 +1,9 @@
-"""A naive lane service, in the style of the first published Hough, AlexNet and Kalman lane tracker.
+"""A straightforward lane service as a baseline, in the style of the first published Hough, AlexNet and Kalman tracker.
 
-Receive a frame, find its lanes, send them, receive the next: in the event loop, one frame at a time. Candidates are the
-strongest lines of the extended Hough transform; for each the whole frame is masked but for 15 pixels to either side of
-the line, cropped, and scaled to 224 x 224; a full-size AlexNet in eager PyTorch judges them in one batch; the best one
-on either side is followed by a Kalman filter. The weights are random: a network's time does not depend on them.
+It receives a frame, finds its lanes, sends them and receives the next frame, all in the event loop. The candidates are
+the strongest lines of the extended Hough transform. For each one the frame is masked except for 15 pixels on each side
+of the line, cropped and scaled to 224 x 224. A full-size AlexNet in eager PyTorch classifies them in one batch, and a
+Kalman filter tracks the best one on each side. The weights are random: the run time does not depend on them.
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ from lanestream.detection.hough import ExtendedHough
 from lanestream.road.view import Image
 from lanestream_exporter.alexnet import FULL, AlexNet
 
-HORIZON = 0.45  # a constant of one camera, as a share of the height
-OFFSET = 15  # pixels of a frame that is 640 wide
+HORIZON = 0.45  # of the image height; fixed, as for one camera
+HALF_WIDTH = 15  # pixels on each side of a line, in a frame 640 wide
 
-Line = tuple[float, float]  # columns at the bottom row and at the horizon
+# The columns at the bottom row and at the horizon.
+Line = tuple[float, float]
 
 
 @dataclass
-class NaiveTracker:
-    """A constant-velocity filter for the boundary on either side."""
+class BaselineTracker:
+    """A constant-velocity Kalman filter for the boundary on each side."""
 
     filters: dict[str, KalmanFilter] = field(default_factory=dict)
 
     def update(self, side: str, line: Line | None) -> Line | None:
-        """Where the boundary is now, measured or predicted."""
+        """Returns the boundary's filtered position; without a measured `line` it is predicted."""
         if side not in self.filters:
             if line is None:
                 return None
@@ -59,20 +60,20 @@ def _filter(line: Line) -> KalmanFilter:
     return kalman
 
 
-def candidate_lines(image: Image, most: int) -> list[Line]:
-    """The strongest Hough lines, in pixels of the image."""
+def candidate_lines(image: Image, limit: int) -> list[Line]:
+    """Returns the strongest Hough lines, at most `limit`, in pixels of the image."""
     scale = WORKING_WIDTH / image.shape[1]
-    grey = np.asarray(cv2.cvtColor(cv2.resize(image, None, fx=scale, fy=scale), cv2.COLOR_BGR2GRAY), np.uint8)
-    top, bottom = int(HORIZON * grey.shape[0]), grey.shape[0] - 1
-    lines = ExtendedHough(limit=most).lines(find_edges(grey, top), grey.shape[1], bottom)
+    gray = np.asarray(cv2.cvtColor(cv2.resize(image, None, fx=scale, fy=scale), cv2.COLOR_BGR2GRAY), np.uint8)
+    top, bottom = int(HORIZON * gray.shape[0]), gray.shape[0] - 1
+    lines = ExtendedHough(limit=limit).lines(find_edges(gray, top), gray.shape[1], bottom)
     tops = lines.x_bottom + lines.slope * (top - bottom)
     return [(float(x) / scale, float(t) / scale) for x, t in zip(lines.x_bottom, tops, strict=True)]
 
 
 def masked_patch(image: Image, line: Line) -> Image:
-    """The frame masked but for the line's strip, cropped to it and scaled."""
+    """Returns the frame with everything masked except the strip along the line, cropped to the strip and scaled."""
     height, width = image.shape[:2]
-    offset, top = OFFSET * width / WORKING_WIDTH, HORIZON * height
+    offset, top = HALF_WIDTH * width / WORKING_WIDTH, HORIZON * height
     near, far = line
     strip = [(near - offset, height), (near + offset, height), (far + offset, top), (far - offset, top)]
     corners = np.clip(np.array(strip), (-4.0 * width, 0.0), (5.0 * width, height)).astype(np.int32)
@@ -86,16 +87,16 @@ def masked_patch(image: Image, line: Line) -> Image:
 
 @torch.inference_mode()
 def lane_probabilities(network: AlexNet, patches: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The network's word on each patch (N, 224, 224, 3)."""
+    """Returns the probability that each patch shows a boundary; patches are (N, 224, 224, 3)."""
     inputs = torch.from_numpy(patches).permute(0, 3, 1, 2).float() / 255.0
     probabilities: NDArray[np.float32] = torch.softmax(network(inputs), dim=1)[:, 1].numpy()
     return probabilities
 
 
-def find_lanes(network: AlexNet, tracker: NaiveTracker, data: bytes, most: int) -> dict[str, Line | None]:
-    """The two boundaries of the ego lane in an image file."""
+def find_lanes(network: AlexNet, tracker: BaselineTracker, data: bytes, limit: int) -> dict[str, Line | None]:
+    """Returns the two boundaries of the ego lane in an image file."""
     image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
-    lines = candidate_lines(image, most)
+    lines = candidate_lines(image, limit)
     best: dict[str, Line] = {}
     if lines:
         patches = np.stack([masked_patch(image, line) for line in lines])
@@ -104,12 +105,12 @@ def find_lanes(network: AlexNet, tracker: NaiveTracker, data: bytes, most: int) 
     return {side: tracker.update(side, best.get(side)) for side in ("left", "right")}
 
 
-def create_app(most: int) -> FastAPI:
-    """The service; `most` is how many candidates of a frame are judged."""
+def create_app(limit: int) -> FastAPI:
+    """Returns the service, which classifies at most `limit` candidates per frame."""
     app = FastAPI()
     torch.manual_seed(0)
     network = AlexNet(normalised=False).eval()
-    lane_probabilities(network, np.zeros((most, FULL.size, FULL.size, 3), np.uint8))
+    lane_probabilities(network, np.zeros((limit, FULL.size, FULL.size, 3), np.uint8))
 
     @app.get("/readyz")
     async def ready() -> dict[str, str]:
@@ -118,10 +119,10 @@ def create_app(most: int) -> FastAPI:
     @app.websocket("/stream")
     async def stream(socket: WebSocket) -> None:
         await socket.accept()
-        tracker = NaiveTracker()
+        tracker = BaselineTracker()
         try:
             while True:
-                lanes = find_lanes(network, tracker, await socket.receive_bytes(), most)
+                lanes = find_lanes(network, tracker, await socket.receive_bytes(), limit)
                 await socket.send_text(json.dumps({"type": "lanes", **lanes}))
         except WebSocketDisconnect:
             pass

@@ -1,4 +1,4 @@
-"""The pipeline without a service: what a program has that loads Lanestream itself, with as many threads."""
+"""The in-process runners: a program that loads Lanestream itself, with as many threads as the service has."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from multiprocessing.connection import Connection
 
 import cv2
 
-from bench.frames import FPS, Clips, to_and_fro
-from bench.orders import Answer, Kind, Order, Tally
+from bench.frames import FPS, Clips, forward_and_backward
+from bench.workload import PIPELINE, POOL, LoadRequest, LoadResult, Reply
 from lanestream.detection import in_one
 from lanestream.engine import Engine, load_engine
 from lanestream.images.decoding import ImageLimits, decode
@@ -33,11 +33,8 @@ from lanestream.workers.thread_pool import ThreadPool
 
 
 @dataclass(frozen=True)
-class Hello:
-    """What the pipeline tells of itself.
-
-    The service's processes and their threads, the network, and patches a frame of the largest size.
-    """
+class PipelineInfo:
+    """The service's processes and the threads of each, the default network, and its patches per frame (LARGE)."""
 
     processes: int
     threads: int
@@ -47,7 +44,7 @@ class Hello:
 
 
 def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
-    """The process: takes orders from `pipe` until it is closed."""
+    """Serves load requests from `pipe` until it is closed; the target of a process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     settings = load_settings()
     cv2.setNumThreads(settings.opencv_threads)
@@ -59,29 +56,29 @@ def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
     patches = patches_per_frame(engine, clips[max(clips)])
     with ThreadPoolExecutor(1) as worker, asyncio.Runner() as loop:
         setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
-        runners: dict[Kind, WorkerPool] = {
-            "pipeline": ThreadPool(engine, settings.image_limits, threads),
-            "pool": worker.submit(loop.run, ProcessPool.started(setup, processes, settings.threads_of)).result(),
+        pools: dict[str, WorkerPool] = {
+            PIPELINE: ThreadPool(engine, settings.image_limits, threads),
+            POOL: worker.submit(loop.run, ProcessPool.started(setup, processes, settings.threads_of)).result(),
         }
-        pipe.send(Hello(processes, threads // processes, network.name, network.provider, patches))
+        pipe.send(PipelineInfo(processes, threads // processes, network.name, network.provider, patches))
         while True:
-            order: Order = pipe.recv()
-            cameras = Cameras(engine, order, clips[order.size], threads)
-            runner = runners.get(order.kind)
-            step = cameras.loop if runner is None else partial(loop.run, cameras.run(runner))
-            working = worker.submit(step)
+            request: LoadRequest = pipe.recv()
+            cameras = InProcessCameras(engine, request, clips[request.size], threads)
+            pool = pools.get(request.runner)
+            run = cameras.run_loop if pool is None else partial(loop.run, cameras.run_pool(pool))
+            future = worker.submit(run)
             while not pipe.poll(0.02):
                 if cameras.settled:
                     pipe.send(None)
                     break
             pipe.recv()
             cameras.stopped.set()
-            error = working.exception()
-            pipe.send(cameras.tally if error is None else f"the pipeline in process failed: {error!r}")
+            error = future.exception()
+            pipe.send(cameras.result if error is None else f"an in-process runner failed: {error!r}")
 
 
 def patches_per_frame(engine: Engine, jpegs: Sequence[bytes]) -> float:
-    """How many patches the default detector shows its network, in the mean over a drive."""
+    """Returns how many patches per frame the default detector classifies, on average over a drive."""
     session = engine.open_session()
     patches = 0
     for number, jpeg in enumerate(jpegs):
@@ -97,32 +94,34 @@ def patches_per_frame(engine: Engine, jpegs: Sequence[bytes]) -> float:
 
 
 @dataclass
-class Cameras:
-    """The cameras of an order, from image files to lanes; each has one frame at a time on its way."""
+class InProcessCameras:
+    """The cameras of a load request, from image files to lanes. Each camera has one frame in progress at a time."""
 
     engine: Engine
-    order: Order
+    request: LoadRequest
     jpegs: Sequence[bytes]
     threads: int
-    tally: Tally = field(default_factory=Tally)
+    result: LoadResult = field(default_factory=LoadResult)
     stopped: threading.Event = field(default_factory=threading.Event)
     _answered: set[int] = field(default_factory=set)
 
     @property
     def settled(self) -> bool:
-        """Whether every camera had an answer."""
-        return len(self._answered) == self.order.sessions
+        """Whether every camera has had a reply."""
+        return len(self._answered) == self.request.sessions
 
-    def loop(self) -> None:
-        """As a script would: every thread takes the frames of its cameras one after the other, from end to end."""
+    def run_loop(self) -> None:
+        """Works like a script: every thread processes the frames of its cameras one after the other."""
         local, threads = LocalEngine(self.engine), self.threads
-        cameras = [(number, local.open_camera(detector=self.order.detector)) for number in range(self.order.sessions)]
+        cameras = [
+            (number, local.open_camera(detector=self.request.detector)) for number in range(self.request.sessions)
+        ]
         with ThreadPoolExecutor(threads) as workers:
             list(workers.map(self._loop, [cameras[thread::threads] for thread in range(min(threads, len(cameras)))]))
 
-    async def run(self, runner: WorkerPool) -> None:
-        """As a service runs it: its threads or processes and its batches, nothing of the network."""
-        cameras = [asyncio.create_task(self._follow(runner, number)) for number in range(self.order.sessions)]
+    async def run_pool(self, pool: WorkerPool) -> None:
+        """Works like the service, with its threads or processes and its batches, but without the network."""
+        cameras = [asyncio.create_task(self._stream(pool, number)) for number in range(self.request.sessions)]
         stopped = asyncio.create_task(asyncio.to_thread(self.stopped.wait))
         done, _ = await asyncio.wait({stopped, *cameras}, return_when=asyncio.FIRST_COMPLETED)
         for camera in cameras:
@@ -131,13 +130,13 @@ class Cameras:
         self.stopped.set()
         await asyncio.gather(*done)
 
-    async def _follow(self, runner: WorkerPool, number: int) -> None:
-        camera, seq = runner.open_camera(detector=self.order.detector), 0
+    async def _stream(self, pool: WorkerPool, number: int) -> None:
+        camera, seq = pool.open_camera(detector=self.request.detector), 0
         while True:
             started = time.monotonic()
-            async with runner.turn():
-                await runner.run(camera, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
-            self._note(number, started)
+            async with pool.turn():
+                await pool.run(camera, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
+            self._add_reply(number, started)
             seq += 1
 
     def _loop(self, cameras: Sequence[tuple[int, LocalCamera]]) -> None:
@@ -146,11 +145,11 @@ class Cameras:
                 return
             started = time.monotonic()
             camera.lanes(self._jpeg(number, seq), seq=seq, timestamp=seq / FPS)
-            self._note(number, started)
+            self._add_reply(number, started)
 
     def _jpeg(self, number: int, seq: int) -> bytes:
-        return self.jpegs[to_and_fro(7 * number + seq, len(self.jpegs))]
+        return self.jpegs[forward_and_backward(7 * number + seq, len(self.jpegs))]
 
-    def _note(self, number: int, started: float) -> None:
-        self.tally.answers.append(Answer(number, started, time.monotonic()))
+    def _add_reply(self, number: int, started: float) -> None:
+        self.result.replies.append(Reply(number, started, time.monotonic()))
         self._answered.add(number)

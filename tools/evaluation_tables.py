@@ -1,4 +1,4 @@
-"""The tables of the model card, from the file that `lanestream evaluate --json` wrote."""
+"""Prints the tables of the model card, from the file that `lanestream evaluate --json` wrote."""
 
 from __future__ import annotations
 
@@ -17,21 +17,25 @@ Groups = Mapping[str, Any]
 def main(path: Path) -> None:
     """Print every table of the model card as Markdown, from PATH."""
     try:
-        figures = json.loads(path.read_text(encoding="utf-8"))
-        images, clips = figures["images"], figures["clips"]
+        evaluation = json.loads(path.read_text(encoding="utf-8"))
+        images, clips = evaluation["images"], evaluation["clips"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise click.ClickException(f"{path} is not what `lanestream evaluate --json` writes: {error}") from error
+        raise click.ClickException(f"{path} was not written by `lanestream evaluate --json`: {error}") from error
     for title, head, rows in (
         ("A. Candidates by the classifier", _CANDIDATES, _rows(images, _candidates)),
-        ("A. Candidates by the detector", _CANDIDATES, _rows(images, _decided)),
-        ("Proposal recall", _PROPOSED, _rows(images, _proposed)),
+        ("A. Candidates by the detector", _CANDIDATES, _rows(images, _detected)),
+        ("Proposal recall", _PROPOSAL_RECALL, _rows(images, _proposal_recall)),
         ("B. Single images", _BOUNDARIES, _rows(images, lambda groups: _boundaries(groups["boundaries"]))),
         ("B. With the tracker", _BOUNDARIES, _rows(clips, lambda groups: _boundaries(groups["tracked"]))),
-        ("B. The same frames without", _BOUNDARIES, _rows(clips, lambda groups: _boundaries(groups["alone"]))),
-        ("Steadiness", _STEADY, _rows(clips, _steady)),
+        (
+            "B. Without the tracker",
+            _BOUNDARIES,
+            _rows(clips, lambda groups: _boundaries(groups["alone"])),
+        ),
+        ("Steadiness", _STEADINESS, _rows(clips, _steady)),
         ("Lateral error", _LATERAL, _rows(images, _lateral)),
-        ("C. The field's metrics", _FIELD, _rows(images, lambda groups: _field(groups["field"]))),
-        ("C. Of the ego pair alone", _FIELD, _rows(images, lambda groups: _field(groups["field"]["ego"]))),
+        ("C. Standard metrics", _METRICS, _rows(images, lambda groups: _metrics(groups["field"]))),
+        ("C. The ego boundaries only", _METRICS, _rows(images, lambda groups: _metrics(groups["field"]["ego"]))),
     ):
         click.echo(f"\n**{title}**\n")
         for row in (("", *head), ["---"] * (len(head) + 1), *rows):
@@ -39,15 +43,15 @@ def main(path: Path) -> None:
 
 
 _CANDIDATES = ("precision", "recall", "accuracy", "average precision", "base rate", "unsure, unknown")
-_PROPOSED = ("ego, 8", "ego, 16", "ego, 32", "all, 8", "all, 16", "all, 32")
+_PROPOSAL_RECALL = ("ego, 8", "ego, 16", "ego, 32", "all, 8", "all, 16", "all, 32")
 _BOUNDARIES = ("ego precision", "ego recall", "ego error, px", "all precision", "all recall")
-_STEADY = ("both ego boundaries", "jitter, px", "identity switches")
-_LATERAL = ("10 m, px", "of a constant's", "30 m, px", "of a constant's", "told so far", "straight on")
-_FIELD = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
+_STEADINESS = ("both ego boundaries", "jitter, px", "identity switches")
+_LATERAL = ("10 m, px", "over constant", "30 m, px", "over constant", "reached 30 m", "over straight line")
+_METRICS = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
 
 
 def _rows(methods: Mapping[str, Any], cells: Any) -> Iterable[list[str]]:
-    """A row for each drive and method that has such figures."""
+    """Yields a row for each drive and method that has such numbers."""
     for drive in next(iter(methods.values())):
         for method, drives in methods.items():
             row = cells(drives[drive])
@@ -58,14 +62,14 @@ def _rows(methods: Mapping[str, Any], cells: Any) -> Iterable[list[str]]:
 def _candidates(groups: Groups) -> list[str]:
     if "candidates" not in groups:
         return []
-    return _judged(groups["candidates"]["far_40"])
+    return _confusion(groups["candidates"]["far_40"])
 
 
-def _decided(groups: Groups) -> list[str]:
-    return _judged(groups["candidates"]["decided"]["far_40"]) if "candidates" in groups else []
+def _detected(groups: Groups) -> list[str]:
+    return _confusion(groups["candidates"]["decided"]["far_40"]) if "candidates" in groups else []
 
 
-def _judged(part: Groups) -> list[str]:
+def _confusion(part: Groups) -> list[str]:
     tp, fp, fn, tn = (part["confusion"][key] for key in ("tp", "fp", "fn", "tn"))
     return [
         _counted(part, "precision", tp, tp + fp),
@@ -77,7 +81,7 @@ def _judged(part: Groups) -> list[str]:
     ]
 
 
-def _proposed(groups: Groups) -> list[str]:
+def _proposal_recall(groups: Groups) -> list[str]:
     if "candidates" not in groups:
         return []
     parts = [groups["candidates"]["proposal_recall"][which] for which in ("ego", "all")]
@@ -113,8 +117,8 @@ def _steady(groups: Groups) -> list[str]:
 
 def _lateral(groups: Groups) -> list[str]:
     cells = []
-    for place in ("10m", "30m"):
-        part = groups["lateral"][place]
+    for distance in ("10m", "30m"):
+        part = groups["lateral"][distance]
         cells += [
             f"{_pixels(part['mean_px_640'])} ({part['reported']} of {part['labeled']})",
             f"{_share(part['ratio'])}{_interval(part, 'ratio')}",
@@ -123,7 +127,7 @@ def _lateral(groups: Groups) -> list[str]:
     return [*cells, str(far["reached"]), f"{_share(far['straight_ratio'])}{_interval(far, 'straight_ratio')}"]
 
 
-def _field(part: Groups) -> list[str]:
+def _metrics(part: Groups) -> list[str]:
     tusimple, culane = part["tusimple"], part["culane"]
     return [
         f"{_share(tusimple['accuracy'])}{_interval(tusimple, 'accuracy')}",

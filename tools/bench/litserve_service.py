@@ -1,6 +1,6 @@
-"""LitServe around our own detector, for single images: what one gets who takes a serving framework for it."""
+"""Our own detector for single images in LitServe: what a general serving framework achieves with it."""
 
-# No `annotations` from the future here: LitServe looks at the annotation of `request` and wants the class itself.
+# Without `from __future__ import annotations`: LitServe reads the annotation of `request` and needs the class itself.
 
 import argparse
 import time
@@ -13,49 +13,49 @@ import numpy as np
 from lanestream.detection import Question, Steps, in_one
 from lanestream.detection.features import WORKING_WIDTH
 from lanestream.engine import load_engine
-from lanestream.images.decoding import ImageLimits, Picture, decode_reduced
+from lanestream.images.decoding import DecodedImage, ImageLimits, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.road.results import FrameResult
 from lanestream.runtime import Provider
 
-# LitServe's documentation takes batches of 8 and waits 50 to 100 ms for them; a tenth of that is kinder to few clients.
-MOST_IMAGES: Final = 8
-WAIT_S: Final = 0.01
+# LitServe's documentation uses batches of 8 that wait 50 to 100 ms. A shorter wait is better with few clients.
+MAX_BATCH_SIZE: Final = 8
+BATCH_TIMEOUT_S: Final = 0.01
 
 
-class LaneApi(litserve.LitAPI):  # type: ignore[misc]
-    """Images in, lanes out: no camera's memory, every image on its own."""
+class LitServeLaneApi(litserve.LitAPI):  # type: ignore[misc]
+    """Images in, lanes out. There are no cameras: every image is processed on its own."""
 
     def __init__(self, provider: Provider) -> None:
-        super().__init__(max_batch_size=MOST_IMAGES, batch_timeout=WAIT_S)
+        super().__init__(max_batch_size=MAX_BATCH_SIZE, batch_timeout=BATCH_TIMEOUT_S)
         self._provider = provider
 
-    def setup(self, device: str) -> None:  # noqa: ARG002 - LitServe's hook; the provider is ours
-        """Loads and warms the networks, in the worker."""
+    def setup(self, device: str) -> None:  # noqa: ARG002 - LitServe's signature
+        """Loads and warms up the networks, in the worker process."""
         self._engine = load_engine(provider=self._provider)
 
-    def decode_request(self, request: litserve.Request) -> Picture:
-        """The picture of a form."""
+    def decode_request(self, request: litserve.Request) -> DecodedImage:
+        """Decodes the image in the form field `image`."""
         return decode_reduced(request["image"].file.read(), ImageLimits(), WORKING_WIDTH)
 
-    def predict(self, pictures: Sequence[Picture]) -> list[ProcessedFrame]:
-        """The lanes of a batch of images."""
-        frames = [self._engine.open_session().follow(picture.image, 0.0) for picture in pictures]
+    def predict(self, images: Sequence[DecodedImage]) -> list[ProcessedFrame]:
+        """Finds the lanes in a batch of images."""
+        frames = [self._engine.open_session().follow(image.image, 0.0) for image in images]
         return [
-            ProcessedFrame.of(picture, result, _NO_TIMING)
-            for picture, result in zip(pictures, in_step(frames), strict=True)
+            ProcessedFrame.of(image, result, _NO_TIMING)
+            for image, result in zip(images, run_batched(frames), strict=True)
         ]
 
     def encode_response(self, output: ProcessedFrame) -> dict[str, Any]:
-        """The same message as the service's."""
+        """Returns the message that our service sends, too."""
         return lanes_message(output, seq=0, timestamp=time.monotonic()).model_dump(mode="json")
 
 
 _NO_TIMING: Final = dict.fromkeys(("decode", "propose", "queue", "infer", "track", "total"), 0.0)
 
 
-def in_step(frames: Sequence[Steps[FrameResult]]) -> list[FrameResult]:
-    """The results of all frames, what they ask of one network at a time answered in one run."""
+def run_batched(frames: Sequence[Steps[FrameResult]]) -> list[FrameResult]:
+    """Returns the results of all frames. Their inputs for the same network are run as one batch."""
     whole = [in_one(steps) for steps in frames]
     results: dict[int, FrameResult] = {}
     asked: dict[int, Question] = {}
@@ -83,5 +83,5 @@ if __name__ == "__main__":
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--provider", required=True)
     options = parser.parse_args()
-    server = litserve.LitServer(LaneApi(options.provider), accelerator="cpu", devices=1, timeout=120)
+    server = litserve.LitServer(LitServeLaneApi(options.provider), accelerator="cpu", devices=1, timeout=120)
     server.run(host="127.0.0.1", port=options.port, log_level="warning", generate_client_file=False)
