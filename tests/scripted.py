@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from lanestream.errors import LanestreamError, answer_to
+from lanestream.errors import LanestreamError, wire_status
 from lanestream.protocol import DrainingMessage, SummaryMessage, error_message
 
 
@@ -96,7 +96,7 @@ class Script:
             return None
         del self.acts[:1]
         body = json.dumps({"code": act.code, "message": act.message, "hint": act.hint})
-        return connection.respond(HTTPStatus(answer_to(act).http_status), body)
+        return connection.respond(HTTPStatus(wire_status(act).http_status), body)
 
     def play(self, connection: ServerConnection) -> None:
         """One connection."""

@@ -20,16 +20,16 @@ from lanestream.errors import (
     ImageTooLargeError,
     LostError,
     ProtocolError,
-    error_of,
+    error_from_code,
 )
 from lanestream.protocol import (
-    AnyServerMessage,
     DrainingMessage,
     EndMessage,
     ErrorMessage,
     FrameMessage,
     LanesMessage,
     ReadyMessage,
+    ServerMessage,
     StartMessage,
     SummaryMessage,
     error_message,
@@ -96,7 +96,7 @@ class ClientProtocol:
         """
         ready = _parsed(text)
         if isinstance(ready, ErrorMessage):
-            raise error_of(ready.code, ready.message, ready.hint)
+            raise error_from_code(ready.code, ready.message, ready.hint)
         if isinstance(ready, DrainingMessage):
             raise DrainingError("the service is about to stop")
         if not isinstance(ready, ReadyMessage):
@@ -157,7 +157,7 @@ class ClientProtocol:
             return results
         if isinstance(message, ErrorMessage):
             if message.fatal or message.seq is None:
-                raise error_of(message.code, message.message, message.hint)
+                raise error_from_code(message.code, message.message, message.hint)
             if message.code == DrainingError.code:
                 return self._put_back(message.seq)
             return self._settle(message.seq, message)
@@ -274,7 +274,7 @@ class ClientProtocol:
         )
 
 
-def _parsed(text: str | bytes) -> AnyServerMessage:
+def _parsed(text: str | bytes) -> ServerMessage:
     if isinstance(text, bytes):
         raise ProtocolError("the service sent a binary message")
     return parse_server_message(text)

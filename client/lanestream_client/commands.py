@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lanestream.errors import ImageError, LanestreamError, LostError, SourceError, needs_extra
-from lanestream.protocol import camera_of
+from lanestream.protocol import parse_camera
 from lanestream.runtime import PROVIDERS
 from lanestream_client.client import LaneClient
 from lanestream_client.failover import Patience
@@ -118,7 +118,7 @@ def detect(
 ) -> None:
     """Find lanes in images: files, or folders of them. Each image stands for itself."""
     files = _files(paths)
-    camera = camera_of(camera_height, field_of_view)
+    camera = parse_camera(camera_height, field_of_view)
     tally = Tally()
     with ExitStack() as stack:
         service = stack.enter_context(_service(context.obj, **where))
@@ -179,7 +179,7 @@ def stream(
 
     SOURCE is a video file, a folder of images, a camera number or an rtsp:// or http:// URL.
     """
-    model = camera_of(camera_height, field_of_view)
+    model = parse_camera(camera_height, field_of_view)
     if session is not None and not where["url"]:
         raise click.UsageError("--session is for the service at --url")
     with ExitStack() as stack:

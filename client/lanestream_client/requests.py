@@ -19,7 +19,7 @@ from lanestream.errors import (
     NoDetectorError,
     ProtocolError,
     SourceError,
-    error_of,
+    error_from_code,
 )
 from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, StartMessage, parse_client_message
 from lanestream_client.service import ServiceInfo
@@ -80,7 +80,7 @@ def refused(status: int, body: bytes | bytearray, place: str) -> LanestreamError
     """The error in an answer that is no good one: as the service told it, or else what its status says."""
     try:
         problem: dict[str, Any] = json.loads(body)
-        return error_of(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
+        return error_from_code(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
     except (ValueError, TypeError, KeyError):
         answer = f"{status} {responses.get(status, '')}".rstrip()
         return ConnectionFailedError(f"{place} answered {answer}", "is this a Lanestream service?")

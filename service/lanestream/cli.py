@@ -118,11 +118,11 @@ def serve(*, print_config: bool, **given: Any) -> None:
         # The image module comes first, because OpenCV reads its limit once.
         from lanestream.api.server import serve as run
         from lanestream.engine import load_engine, resolve_regressor
-        from lanestream.settings import load_settings, shown
+        from lanestream.settings import load_settings, to_toml
         from lanestream_client.overlays import draw_lanes
     settings = load_settings(**given)
     if print_config:
-        click.echo(shown(settings))
+        click.echo(to_toml(settings))
         return
     regressor = resolve_regressor(settings.regressor)
     load = partial(load_engine, settings.model, settings.provider, regressor, settings.runtime_options)
