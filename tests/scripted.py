@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from lanestream.errors import LanestreamError, answer_to
+from lanestream.errors import LanestreamError, wire_status
 from lanestream.protocol import DrainingMessage, SummaryMessage, error_message
 
 
@@ -100,7 +100,7 @@ class Script:
             return None
         del self.steps[:1]
         body = json.dumps({"code": step.code, "message": step.message, "hint": step.hint})
-        return connection.respond(HTTPStatus(answer_to(step).http_status), body)
+        return connection.respond(HTTPStatus(wire_status(step).http_status), body)
 
     def handle(self, connection: ServerConnection) -> None:
         """Runs the next step on a connection."""

@@ -1,6 +1,6 @@
-"""Writes the stream protocol as an AsyncAPI document, and validates it if a schema is given.
+"""Writes the contract of the stream as an AsyncAPI document. Validates it first if a schema is given.
 
-python tools/asyncapi.py docs/asyncapi.yaml [SCHEMA]     SCHEMA: schemas/3.0.0.json of the npm package @asyncapi/specs
+python tools/asyncapi.py docs/asyncapi.yaml [SCHEMA]     SCHEMA: json_schemas/3.0.0.json of the npm package @asyncapi/specs
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ import yaml
 from lanestream.asyncapi import document
 
 
-def document_yaml() -> str:
-    """Returns the document as YAML, with its keys in their original order."""
-    head = "# Generated from the models in service/lanestream/protocol.py: `make asyncapi`.\n"
+def to_yaml() -> str:
+    """Returns the document as YAML, in its own order."""
+    head = "# Generated from the models in service/lanestream/protocol.py by `make asyncapi`.\n"
     return head + yaml.safe_dump(document(), sort_keys=False, allow_unicode=True, width=120)
 
 
 def main(out: Path, schema: Path | None = None) -> None:
-    """Writes the document to `out`. Exits with the first error if it does not match `schema`."""
+    """Writes the document to `out`. Exits with an error if it violates the `schema`."""
     if schema is not None:
         errors = jsonschema_rs.validator_for(json.loads(schema.read_text())).iter_errors(document())
         for error in errors:
-            sys.exit(f"not valid AsyncAPI: {'/'.join(map(str, error.instance_path))}: {error.message[:500]}")
-    out.write_text(document_yaml())
+            path = "/".join(map(str, error.instance_path))
+            sys.exit(f"not a valid AsyncAPI document: {path}: {error.message[:500]}")
+    out.write_text(to_yaml())
 
 
 if __name__ == "__main__":

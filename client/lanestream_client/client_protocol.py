@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import Literal
 
-from lanestream.errors import DrainingError, ImageTooLargeError, LostError, ProtocolError, error_of
+from lanestream.errors import DrainingError, ImageTooLargeError, LostError, ProtocolError, error_from_code
 from lanestream.protocol import (
-    AnyServerMessage,
+    ServerMessage,
     DrainingMessage,
     EndMessage,
     ErrorMessage,
@@ -99,7 +99,7 @@ class ClientProtocol:
         """
         ready = _parse(text)
         if isinstance(ready, ErrorMessage):
-            raise error_of(ready.code, ready.message, ready.hint)
+            raise error_from_code(ready.code, ready.message, ready.hint)
         if isinstance(ready, DrainingMessage):
             raise DrainingError("the service is about to stop")
         if not isinstance(ready, ReadyMessage):
@@ -156,7 +156,7 @@ class ClientProtocol:
             return self._settle(message.seq, message)
         if isinstance(message, ErrorMessage):
             if message.fatal or message.seq is None:
-                raise error_of(message.code, message.message, message.hint)
+                raise error_from_code(message.code, message.message, message.hint)
             if message.code == DrainingError.code:
                 return self._return_to_queue(message.seq)
             return self._settle(message.seq, message)
@@ -281,7 +281,7 @@ class ClientProtocol:
         )
 
 
-def _parse(text: str | bytes) -> AnyServerMessage:
+def _parse(text: str | bytes) -> ServerMessage:
     if isinstance(text, bytes):
         raise ProtocolError("the service sent a binary message; only text messages are expected")
     return parse_server_message(text)

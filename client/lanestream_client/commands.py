@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lanestream.errors import ImageError, LanestreamError, SourceError, needs_extra
-from lanestream.protocol import DetectorName, Mode, camera_of
+from lanestream.protocol import DetectorName, Mode, parse_camera
 from lanestream_client.client import LaneClient
 from lanestream_client.failover import RetryPolicy
 from lanestream_client.frames import SourceFrame, StreamResult
@@ -120,7 +120,7 @@ def detect(
 ) -> None:
     """Find lanes in images: files, or folders of them. Each image is processed on its own."""
     files = _image_files(paths)
-    camera = camera_of(camera_height, field_of_view)
+    camera = parse_camera(camera_height, field_of_view)
     report = RunReport()
     with ExitStack() as stack:
         service = stack.enter_context(_open_service(context.obj, **where))
@@ -187,7 +187,7 @@ def stream(
 
     SOURCE is a video file, a folder of images, a camera number or an rtsp:// or http:// URL.
     """
-    camera = camera_of(camera_height, field_of_view)
+    camera = parse_camera(camera_height, field_of_view)
     if session is not None and not where["url"]:
         raise click.UsageError("--session needs a service: add --url")
     with ExitStack() as stack:

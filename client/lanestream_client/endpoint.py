@@ -28,7 +28,7 @@ from lanestream.errors import (
     ProtocolError,
     SettingsError,
     TooOldError,
-    error_of,
+    error_from_code,
 )
 from lanestream.protocol import SUBPROTOCOL
 
@@ -158,7 +158,7 @@ def refusal_error(status: int, body: bytes | bytearray, url: str) -> LanestreamE
     """Returns the error in an unsuccessful response, or a ConnectionFailedError if it is not from Lanestream."""
     try:
         problem: dict[str, Any] = json.loads(body)
-        return error_of(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
+        return error_from_code(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
     except (ValueError, TypeError, KeyError):
         answer = f"{status} {responses.get(status, '')}".rstrip()
         return ConnectionFailedError(f"{url} answered {answer}", "check that a Lanestream service runs at this URL")

@@ -1,83 +1,50 @@
-"""The contract of `/v1/stream` as an AsyncAPI 3.0 document, made from the very models that the service speaks with.
+"""The contract of `/v1/stream` as an AsyncAPI 3.0 document, generated from the models in `protocol`.
 
-It takes the service's view: what a client sends is received here.
+It takes the service's point of view: it receives what a client sends.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, get_args
 
-from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaMode, JsonSchemaValue, models_json_schema
 from pydantic_core import core_schema
 
 from lanestream import __version__
-from lanestream.errors import told_errors
-from lanestream.protocol import (
-    KEY_SUBPROTOCOL,
-    SUBPROTOCOL,
-    DrainingMessage,
-    EndMessage,
-    ErrorMessage,
-    FrameMessage,
-    LanesMessage,
-    ReadyMessage,
-    StartMessage,
-    SummaryMessage,
-)
+from lanestream.errors import documented_errors
+from lanestream.protocol import KEY_SUBPROTOCOL, SUBPROTOCOL, ClientMessage, Message, ServerMessage
 
-_SCHEMAS: Final = "#/components/schemas/"
+_SCHEMAS: Final = "#/components/json_schemas/"
 _STREAM: Final = "#/channels/stream"
-_CLIENT: Final[tuple[type[BaseModel], ...]] = (StartMessage, FrameMessage, EndMessage)
-_SERVER: Final[tuple[type[BaseModel], ...]] = (
-    ReadyMessage,
-    LanesMessage,
-    ErrorMessage,
-    DrainingMessage,
-    SummaryMessage,
-)
-_EXAMPLES: Final[dict[str, dict[str, Any]]] = {
-    "start": {"type": "start", "mode": "all", "camera": {"height": 1.4, "field_of_view": 62.0}},
-    "frame": {"type": "frame", "seq": 7, "timestamp": 0.28},
-    "end": {"type": "end"},
-    "error": {
-        "type": "error",
-        "code": "bad_image",
-        "message": "the JPEG image is cut short: its end is missing",
-        "hint": "send the whole file",
-        "seq": 7,
-        "fatal": False,
-    },
-    "draining": {"type": "draining", "resume_token": "4Hs0...", "deadline_s": 10.0},
-    "summary": {"type": "summary", "frames": 250, "answered": 248, "failed": 1, "dropped": 1, "duration_s": 10.02},
-}
-# Closes without an error; the others follow one, whose code tells which.
-_CLOSES: Final[dict[int, str]] = {
+_CLIENT: Final[tuple[type[Message], ...]] = get_args(ClientMessage)
+_SERVER: Final[tuple[type[Message], ...]] = get_args(ServerMessage)
+# Close codes that do not follow an error; the others belong to the code of an error.
+_CLOSE_CODES: Final[dict[int, str]] = {
     1000: "after `summary`",
-    1009: "a message of more than twice the bytes that an image may have",
-    1012: "after `draining`, when every frame that came before was answered",
+    1009: "a message is larger than twice the size limit of an image",
+    1012: "after `draining`, once every frame that arrived before it was answered",
 }
 
 
 class _Draft7(GenerateJsonSchema):
-    """Schemas in the dialect that AsyncAPI asks for."""
+    """Generates json_schemas in the dialect that AsyncAPI requires."""
 
     def tuple_schema(self, schema: core_schema.TupleSchema) -> JsonSchemaValue:
-        """A tuple's items in one list, as it was written before 2020."""
-        written = super().tuple_schema(schema)
-        if "prefixItems" in written:
-            written["items"] = written.pop("prefixItems")
-        return written
+        """Lists the items of a tuple as `items`, where newer dialects use `prefixItems`."""
+        generated = super().tuple_schema(schema)
+        if "prefixItems" in generated:
+            generated["items"] = generated.pop("prefixItems")
+        return generated
 
 
 def document() -> dict[str, Any]:
-    """The AsyncAPI document, of plain values."""
+    """Returns the AsyncAPI document as plain values."""
     return {
         "asyncapi": "3.0.0",
         "info": {
             "title": "Lanestream",
             "version": __version__,
-            "description": "Camera frames in, tracked lane lines out. docs/protocol.md tells the protocol in prose.",
+            "description": "Camera frames in, tracked lane lines out. See docs/protocol.md for the protocol in prose.",
             "license": {"name": "Apache-2.0", "url": "https://www.apache.org/licenses/LICENSE-2.0"},
         },
         "defaultContentType": "application/json",
@@ -86,7 +53,7 @@ def document() -> dict[str, Any]:
         "operations": _operations(),
         "components": {
             "messages": {**_messages(), "image": _image()},
-            "schemas": _schemas(),
+            "json_schemas": _schemas(),
             "securitySchemes": _security(),
         },
     }
@@ -96,7 +63,8 @@ def _server() -> dict[str, Any]:
     return {
         "host": "127.0.0.1:8000",
         "protocol": "ws",
-        "description": "What `lanestream serve` listens on. With API keys one of the two ways to show one is needed.",
+        "description": "The default address of `lanestream serve`. A service with API keys requires one of the two"
+        " security schemes.",
         "security": [{"$ref": f"#/components/securitySchemes/{name}"} for name in _security()],
     }
 
@@ -108,96 +76,104 @@ def _security() -> dict[str, Any]:
             "type": "httpApiKey",
             "in": "header",
             "name": "Sec-WebSocket-Protocol",
-            "description": f"For browsers: the subprotocol `{KEY_SUBPROTOCOL}KEY`, offered beside `{SUBPROTOCOL}`.",
+            "description": f"For browsers: the subprotocol `{KEY_SUBPROTOCOL}KEY`, in addition to `{SUBPROTOCOL}`.",
         },
     }
 
 
 def _channel() -> dict[str, Any]:
     headers = {
-        "Sec-WebSocket-Protocol": {"type": "string", "description": f"`{SUBPROTOCOL}`, the version spoken here."},
-        "Authorization": {"type": "string", "description": "`Bearer KEY`, where the service asks for one."},
-        "Origin": {"type": "string", "description": "The page's, from a browser; it has to be an allowed one."},
+        "Sec-WebSocket-Protocol": {"type": "string", "description": f"`{SUBPROTOCOL}`, the version of the protocol."},
+        "Authorization": {"type": "string", "description": "`Bearer KEY`, if the service requires a key."},
+        "Origin": {"type": "string", "description": "The origin of a browser's page, which must be allowed."},
     }
     return {
         "address": "/v1/stream",
         "title": "A stream of frames",
-        "description": "One camera's frames in, the lanes of each out. Only `image` is needed; it is a binary message,"
-        " all others are text. Without compression: images are compressed already.",
+        "description": "The frames of one camera in, the lanes of each frame out. Only `image` is required. It is a"
+        " binary message; all others are text messages. The service declines compression, since images are compressed.",
         "servers": [{"$ref": "#/servers/local"}],
         "messages": {name: {"$ref": f"#/components/messages/{name}"} for name in (*_messages(), "image")},
         "bindings": {"ws": {"method": "GET", "headers": {"type": "object", "properties": headers}}},
         "x-subprotocol": SUBPROTOCOL,
-        "x-close-codes": {str(code): meaning for code, meaning in sorted(_CLOSES.items())},
+        "x-close-codes": {str(code): meaning for code, meaning in sorted(_CLOSE_CODES.items())},
     }
 
 
 def _operations() -> dict[str, Any]:
-    return {
-        "open": _receives("Opens the stream; without it the first image does.", ["start"], ["ready", "error"]),
-        "find": _receives(
-            "One image, with its number and its time right before it.", ["frame", "image"], ["lanes", "error"]
-        ),
-        "end": _receives("No more images come.", ["end"], ["summary"]),
-        "tell": {
-            "action": "send",
+    """Returns one operation per client message, named by its type, and one for the messages that answer none."""
+    replies = {reply for model in _CLIENT for reply in model.replies}
+    unsolicited = [_type(model) for model in _SERVER if _type(model) not in replies]
+    received = {
+        _type(model): {
+            "action": "receive",
             "channel": {"$ref": _STREAM},
-            "summary": "What comes unasked: errors that end the stream, and that the service is about to stop.",
-            "messages": _of_channel(["error", "draining"]),
-        },
+            "summary": _summary(model),
+            # The binary message with the image belongs to the `frame` message before it.
+            "messages": _message_refs(["frame", "image"] if _type(model) == "frame" else [_type(model)]),
+            "reply": {"channel": {"$ref": _STREAM}, "messages": _message_refs(model.replies)},
+        }
+        for model in _CLIENT
     }
-
-
-def _receives(summary: str, messages: list[str], replies: list[str]) -> dict[str, Any]:
-    return {
-        "action": "receive",
+    notify = {
+        "action": "send",
         "channel": {"$ref": _STREAM},
-        "summary": summary,
-        "messages": _of_channel(messages),
-        "reply": {"channel": {"$ref": _STREAM}, "messages": _of_channel(replies)},
+        "summary": "Messages that answer no message: fatal errors, and the announcement that the service stops.",
+        "messages": _message_refs(["error", *unsolicited]),
     }
+    return {**received, "notify": notify}
 
 
-def _of_channel(names: list[str]) -> list[dict[str, str]]:
+def _message_refs(names: list[str] | tuple[str, ...]) -> list[dict[str, str]]:
     return [{"$ref": f"{_STREAM}/messages/{name}"} for name in names]
 
 
 def _messages() -> dict[str, Any]:
-    """The text messages by their type."""
-    told: dict[str, Any] = {}
+    """Returns the text messages by type."""
+    messages: dict[str, Any] = {}
     for model in (*_CLIENT, *_SERVER):
-        name = model.model_fields["type"].default
-        told[name] = {
+        name = _type(model)
+        messages[name] = {
             "name": name,
-            "summary": " ".join((model.__doc__ or "").split("\n\n")[0].split()),
+            "summary": _summary(model),
             "payload": {"$ref": f"{_SCHEMAS}{model.__name__}"},
         }
-        if name in _EXAMPLES:
-            told[name]["examples"] = [{"payload": _EXAMPLES[name]}]
-    told["error"]["x-codes"] = {
-        code: {"meaning": meaning, "close": answer.close_code, "http": answer.http_status}
-        for code, (meaning, answer) in told_errors().items()
+        if model.example is not None:
+            messages[name]["examples"] = [{"payload": model.example}]
+    messages["error"]["x-codes"] = {
+        code: {"meaning": meaning, "close": status.close_code, "http": status.http_status}
+        for code, (meaning, status) in documented_errors().items()
     }
-    return told
+    return messages
+
+
+def _type(model: type[Message]) -> str:
+    name: str = model.model_fields["type"].default
+    return name
+
+
+def _summary(model: type[Message]) -> str:
+    """Returns the first paragraph of the model's docstring on one line."""
+    return " ".join((model.__doc__ or "").split("\n\n")[0].split())
 
 
 def _image() -> dict[str, Any]:
     return {
         "name": "image",
-        "summary": "Client: the file of one frame, as a binary message.",
-        "description": "A JPEG; image/png and image/webp are accepted as well. At most `max_bytes` and `max_pixels` of"
-        " the limits that `ready` tells.",
+        "summary": "Client: the image file of one frame, as a binary message.",
+        "description": "A JPEG; image/png and image/webp are also accepted. `max_bytes` and `max_pixels` of the limits"
+        " in `ready` apply.",
         "contentType": "image/jpeg",
         "payload": {"type": "string", "format": "binary"},
     }
 
 
 def _schemas() -> dict[str, Any]:
-    """Schemas of the text messages and their parts: clients may leave out what has a default, the service does not."""
-    models: list[tuple[type[BaseModel], JsonSchemaMode]] = [
+    """Returns the json_schemas of the text messages and their parts. Clients may omit defaults; the service never does."""
+    models: list[tuple[type[Message], JsonSchemaMode]] = [
         *((model, "validation") for model in _CLIENT),
         *((model, "serialization") for model in _SERVER),
     ]
-    _, schemas = models_json_schema(models, ref_template=f"{_SCHEMAS}{{model}}", schema_generator=_Draft7)
-    definitions: dict[str, Any] = schemas["$defs"]
+    _, json_schemas = models_json_schema(models, ref_template=f"{_SCHEMAS}{{model}}", schema_generator=_Draft7)
+    definitions: dict[str, Any] = json_schemas["$defs"]
     return definitions

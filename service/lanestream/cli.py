@@ -125,13 +125,13 @@ def serve(*, print_config: bool, **options: Any) -> None:
     with needs_extra("service,cpu"):
         from lanestream.api.server import serve as run
         from lanestream.engine import load_engine, resolve_regressor
-        from lanestream.settings import load_settings, shown
+        from lanestream.settings import load_settings, to_toml
 
         # Last: OpenCV reads its pixel limit when it is first imported, and the service's modules set that limit before.
         draw_lanes = _load_overlay()
     settings = load_settings(**options)
     if print_config:
-        click.echo(shown(settings))
+        click.echo(to_toml(settings))
         return
     regressor = resolve_regressor(settings.regressor)
     load = partial(load_engine, settings.model, settings.provider, regressor, settings.runtime_options)

@@ -1,4 +1,4 @@
-"""API keys: random tokens of which a service knows the hashes alone."""
+"""API keys: random tokens. The service stores only their hashes."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from typing import Final
 
 from lanestream.errors import SettingsError
 
-# Of characters that a header and a WebSocket subprotocol may have. The beginning is there for those who search for keys
-# that have got somewhere they should not be.
+# Tokens use only characters that are valid in a header and in a WebSocket subprotocol. The prefix helps secret scanners
+# to find tokens that were leaked.
 _PREFIX: Final = "lane_"
 _RANDOM_BYTES: Final = 32
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
-_FORM: Final = "NAME:SHA256 is expected, as `lanestream key NAME` prints it"
+_FORMAT: Final = "expected NAME:SHA256, as printed by `lanestream key NAME`"
 
 
 @dataclass(frozen=True)
 class ApiKey:
-    """What a service knows of a key: its name, and the SHA-256 of the token in hexadecimal digits.
+    """The stored form of a key: its name, and the SHA-256 of its token in hexadecimal.
 
-    A plain hash will do, unlike for passwords: nobody guesses 256 random bits.
+    Unlike a password, a token of 256 random bits can't be guessed, so a plain hash is sufficient.
     """
 
     name: str
@@ -37,18 +37,18 @@ class ApiKey:
 
 
 def new_key(name: str) -> tuple[str, ApiKey]:
-    """A new token, and what a service has to know of it. Raises SettingsError for a name that can't be one."""
+    """Returns a new token and its stored form. Raises SettingsError for an invalid name."""
     if not _NAME.fullmatch(name):
         raise SettingsError(
-            f"{name!r} can't be the name of a key",
-            "1 to 64 letters, digits, dots, hyphens and underscores are accepted",
+            f"{name!r} is not a valid name for a key",
+            "use 1 to 64 letters, digits, dots, hyphens and underscores",
         )
     token = _PREFIX + secrets.token_urlsafe(_RANDOM_BYTES)
     return token, ApiKey(name, _digest(token))
 
 
-def find(keys: Sequence[ApiKey], token: str) -> ApiKey | None:
-    """The key whose token this is. How long that takes tells nothing of the keys."""
+def find_key(keys: Sequence[ApiKey], token: str) -> ApiKey | None:
+    """Returns the key of this token. The running time does not depend on where the digests differ."""
     digest, found = _digest(token), None
     for key in keys:
         if hmac.compare_digest(key.digest, digest):
@@ -57,31 +57,31 @@ def find(keys: Sequence[ApiKey], token: str) -> ApiKey | None:
 
 
 def parse_keys(entries: Iterable[str], unit: str) -> tuple[ApiKey, ...]:
-    """The keys of `entries`, each NAME:SHA256; empty ones and those that begin with # are none.
+    """Returns the keys in `entries`, each NAME:SHA256. Skips empty entries and comments (#).
 
-    Two keys of one name are one caller, so that a key can be replaced without a gap. Raises ValueError, which tells the
-    number of the `unit` and nothing of what it has, and where there is no key at all.
+    Two keys with the same name are one caller, so a key can be replaced without downtime. Raises ValueError for an
+    invalid entry, which is identified by `unit` and number and never quoted, and if there is no key at all.
     """
-    keys = tuple(_parsed(entries, unit))
+    keys = tuple(_parse_entries(entries, unit))
     if not keys:
-        raise ValueError(f"no key in it; {_FORM}")
+        raise ValueError(f"no key found; {_FORMAT}")
     return keys
 
 
 def read_keys(path: Path) -> tuple[ApiKey, ...]:
-    """The keys of a file, one a line. Raises SettingsError where it can't be read, and for what is no key."""
+    """Returns the keys in a file, one per line. Raises SettingsError if it can't be read or a line is not a key."""
     try:
         return parse_keys(path.read_text(encoding="utf-8-sig").splitlines(), "line")
     except OSError as error:
-        reason = (error.strerror or "it can't be read").lower()
+        reason = (error.strerror or "the file can't be read").lower()
     except UnicodeDecodeError:
-        reason = "it is no text"
+        reason = "not a UTF-8 text file"
     except ValueError as error:
         reason = str(error)
     raise SettingsError(f"API keys file {path}: {reason}")
 
 
-def _parsed(entries: Iterable[str], unit: str) -> Iterator[ApiKey]:
+def _parse_entries(entries: Iterable[str], unit: str) -> Iterator[ApiKey]:
     for number, entry in enumerate(entries, start=1):
         text = entry.strip()
         if not text or text.startswith("#"):
@@ -89,7 +89,7 @@ def _parsed(entries: Iterable[str], unit: str) -> Iterator[ApiKey]:
         name, _, digest = text.partition(":")
         digest = digest.strip().lower()
         if not (_NAME.fullmatch(name) and _DIGEST.fullmatch(digest)):
-            raise ValueError(f"{unit} {number} is no key; {_FORM}")
+            raise ValueError(f"{unit} {number} is not a valid key; {_FORMAT}")
         yield ApiKey(name, digest)
 
 

@@ -1,4 +1,4 @@
-"""From results to messages: the one way in which lanes are told, over HTTP, over a stream and in process."""
+"""Converts results into messages, the same way for HTTP, for streams and in process."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ if TYPE_CHECKING:
     from lanestream.road.results import EgoLane, FrameResult, LaneBoundary
 
 _POINTS: Final = 24
-# Decimals that keep a curve exact to a hundredth of a pixel over the tallest image that is accepted.
+# Decimals that keep a curve exact to a hundredth of a pixel over the tallest accepted image.
 _HORIZON_DECIMALS: Final = 4
 _COEFFICIENT_DECIMALS: Final = (4, 7, 4)
-# And those that keep a place on the road exact to a millimetre over a hundred metres.
+# Decimals that keep a point on the road exact to a millimeter at a distance of a hundred meters.
 _GROUND_DECIMALS: Final = (8, 6, 4)
 
-Ground = tuple[float, float, float]
+GroundCurve = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class ProcessedFrame:
-    """A frame at the end of its way: the width and height of its file, its lanes in pixels of that, all timing."""
+    """A processed frame: the (width, height) of its image file, and its result in pixels of that file, with timing."""
 
     size: tuple[int, int]
     result: FrameResult
 
     @classmethod
     def of(cls, picture: DecodedImage, result: FrameResult, timing_ms: dict[str, float]) -> ProcessedFrame:
-        """From the `result` in pixels of the decoded image."""
+        """Converts a `result` in pixels of the decoded image, which may be smaller than the file's."""
         return cls(picture.size, replace(result.to_image(picture.scaling), timing_ms=timing_ms))
 
 
 def lanes_message(
     frame: ProcessedFrame, *, seq: int, timestamp: float, dropped: int = 0, camera: CameraModel | None = None
 ) -> LanesMessage:
-    """The message about `frame`; `timestamp` in seconds on the client's clock. With a `camera`, in metres too."""
+    """Returns the message for `frame`; `timestamp` is in seconds on the client's clock. A `camera` adds meters."""
     width, height = frame.size
     result = frame.result
     grounds = {} if camera is None else _grounds(result, Camera(camera.height, camera.field_of_view), width)
@@ -76,12 +76,12 @@ def lanes_message(
     )
 
 
-def _grounds(result: FrameResult, camera: Camera, width: int) -> dict[int, Ground]:
-    """The ground parabola of each lane by its track id."""
+def _grounds(result: FrameResult, camera: Camera, width: int) -> dict[int, GroundCurve]:
+    """Returns the ground parabola of each lane by track id."""
     return {lane.track_id: camera.ground(lane.curve, width) for lane in result.lanes}
 
 
-def _lane(lane: LaneBoundary, points: list[Point], ground: Ground | None) -> LaneModel:
+def _lane(lane: LaneBoundary, points: list[Point], ground: GroundCurve | None) -> LaneModel:
     return LaneModel(
         track_id=lane.track_id,
         position=lane.position,
@@ -97,17 +97,17 @@ def _lane(lane: LaneBoundary, points: list[Point], ground: Ground | None) -> Lan
     )
 
 
-def _rounded(values: Ground, decimals: tuple[int, int, int]) -> Ground:
+def _rounded(values: GroundCurve, decimals: tuple[int, int, int]) -> GroundCurve:
     a, b, c = (round(value, places) for value, places in zip(values, decimals, strict=True))
     return a, b, c
 
 
 def _points(lanes: Sequence[LaneBoundary]) -> list[list[Point]]:
-    """The points of each lane, from its lowest row to its highest."""
+    """Returns the points of each lane, from its lowest row to its highest."""
     if not lanes:
         return []
     ends = np.array([(lane.bottom, lane.top) for lane in lanes])
-    # Rounded rows first, so that the points are on the curve.
+    # Rows are rounded before the columns are computed, so that the points lie on the curve.
     rows = np.linspace(ends[:, 0], ends[:, 1], _POINTS, axis=1).round(2)
     columns = Curves.of([lane.curve for lane in lanes]).x(rows).round(2)
     return [[(x, y) for x, y in lane] for lane in np.stack([columns, rows], axis=-1).tolist()]
@@ -117,14 +117,14 @@ def _significant(matrix: FloatArray) -> list[list[float]]:
     return [[float(f"{value:.6g}") for value in row] for row in matrix]
 
 
-def _ego(ego: EgoLane, grounds: dict[int, Ground]) -> EgoModel:
-    told = EgoModel(left=ego.left, right=ego.right, offset=None if ego.offset is None else round(ego.offset, 4))
+def _ego(ego: EgoLane, grounds: dict[int, GroundCurve]) -> EgoModel:
+    model = EgoModel(left=ego.left, right=ego.right, offset=None if ego.offset is None else round(ego.offset, 4))
     sides = [grounds[track] for track in (ego.left, ego.right) if track in grounds]
     if not sides:
-        return told
+        return model
     a, b, c = (fmean(values) for values in zip(*sides, strict=True))
-    metres = {"heading": round(math.atan(b), 6), "curvature": round(2.0 * a, 8)}
+    in_meters = {"heading": round(math.atan(b), 6), "curvature": round(2.0 * a, 8)}
     if len(sides) == 2:
-        # The lane's centre is as far to the left as the camera is to the right of it.
-        metres |= {"offset_m": round(c, 3), "lane_width_m": round(sides[0][2] - sides[1][2], 3)}
-    return told.model_copy(update=metres)
+        # Y points left: a lane center at +c means that the camera is c to the right of it.
+        in_meters |= {"offset_m": round(c, 3), "lane_width_m": round(sides[0][2] - sides[1][2], 3)}
+    return model.model_copy(update=in_meters)

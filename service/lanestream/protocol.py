@@ -1,104 +1,123 @@
-"""The wire contract: the messages of `/v1/stream` and `/v1/detect`, and the rules of their order.
+"""The wire contract: the messages of `/v1/stream` and `/v1/detect`.
 
-Light on purpose: pydantic and the standard library only, so that the client can share it. Coordinates are pixels of the
-image that was sent (x right, y down, pixel centres at integers), timestamps are seconds on the client's clock.
+It imports pydantic and the standard library only, so that the client can share it. Coordinates are pixels of the image
+that was sent (x right, y down, pixel centers at integers). Timestamps are seconds on the client's clock.
+
+To add a message, define its model here and add it to `ClientMessage` or `ServerMessage`. The JSON Schemas and the
+AsyncAPI document follow from that; `StreamProtocol` and the client give it its meaning.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from lanestream.errors import LanestreamError, ProtocolError, one_line
 
 SUBPROTOCOL: Final = "lanestream.v1"
-# What comes after it in the name of another subprotocol is an API key: browsers can't set headers on a WebSocket.
+# The prefix of a second subprotocol that carries an API key: browsers can't set headers on a WebSocket.
 KEY_SUBPROTOCOL: Final = "bearer."
-# Beyond it a number of JSON is not the same one for everybody who reads it (RFC 8259, section 6).
-MOST_SEQ: Final = 2**53 - 1
+# Larger JSON numbers are not read the same by every parser (RFC 8259, section 6).
+MAX_SEQ: Final = 2**53 - 1
 
 Point = tuple[float, float]
 Mode = Literal["latest", "all"]
 SessionName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 DetectorName = Literal["candidates", "regression"]
-CameraHeight = Annotated[float, Field(ge=0.3, le=4.0, description="Metres from the road up to the camera.")]
-FieldOfView = Annotated[float, Field(ge=20.0, le=150.0, description="Degrees between the image's left and right edge.")]
+CameraHeight = Annotated[float, Field(ge=0.3, le=4.0, description="Height of the camera above the road in meters.")]
+FieldOfView = Annotated[float, Field(ge=20.0, le=150.0, description="Horizontal field of view in degrees.")]
 
 
 class Message(BaseModel):
-    """A JSON object on the wire; a field that nobody knows is an error, so that a typing slip is seen."""
+    """A JSON object on the wire. An unknown field is an error, so that typing mistakes are noticed.
+
+    `example` is shown in the AsyncAPI document. `replies` of a client message are the types of the messages that answer
+    it.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    example: ClassVar[dict[str, Any] | None] = None
+    replies: ClassVar[tuple[str, ...]] = ()
+
 
 class CameraModel(Message):
-    """What has to be known of a camera to tell lanes in metres: it looks ahead, over a flat road."""
+    """The camera parameters that coordinates in meters need. The camera looks ahead over a flat road."""
 
     height: CameraHeight
     field_of_view: FieldOfView
 
 
 class StartMessage(Message):
-    """Client: opens the stream. Without it the first frame opens the stream with the defaults.
+    """Client: opens the stream. Without it, the first image opens the stream with the defaults.
 
-    With the token of a session that lives the stream goes on where that session was, on another socket or on another
-    replica of the service: the same boundaries keep their ids. With a token that nobody knows it begins afresh.
+    With the token of a session that still exists, the stream continues that session on another socket or another
+    replica of the service: the same boundaries keep their ids. With an unknown token, a new session starts.
     """
+
+    example = {"type": "start", "mode": "all", "camera": {"height": 1.4, "field_of_view": 62.0}}
+    replies = ("ready", "error")
 
     type: Literal["start"] = "start"
     session: SessionName | None = Field(
-        default=None, description="A name for the session, seen in logs and in `ready`; made up where absent."
+        default=None, description="Name of the session in logs and in `ready`; generated if missing."
     )
     resume_token: Annotated[str, Field(max_length=128)] | None = Field(
-        default=None, description="What `ready` or `draining` told when the session was last open."
+        default=None, description="The token of `ready` or `draining` of the session to resume."
     )
     mode: Mode = "latest"
     detector: DetectorName | None = Field(
-        default=None, description="What finds the lanes; the service's default where absent."
+        default=None, description="The detector that finds the lanes; the service's default if missing."
     )
     horizon: Annotated[float, Field(gt=0.0, lt=1.0)] | None = Field(
-        default=None, description="Row of the horizon as a share of the image height; estimated where absent."
+        default=None, description="Row of the horizon as a fraction of the image height; estimated if missing."
     )
-    camera: CameraModel | None = Field(default=None, description="Lanes are told in metres too where it is given.")
+    camera: CameraModel | None = Field(default=None, description="If present, lanes are also reported in meters.")
 
 
 class FrameMessage(Message):
-    """Client: numbers the binary message that follows. What is absent is assigned by the service."""
+    """Client: number and capture time of the binary message that follows. The service assigns missing fields."""
+
+    example = {"type": "frame", "seq": 7, "timestamp": 0.28}
+    replies = ("lanes", "error")
 
     type: Literal["frame"] = "frame"
-    seq: Annotated[int, Field(ge=0, le=MOST_SEQ)] | None = None
+    seq: Annotated[int, Field(ge=0, le=MAX_SEQ)] | None = None
     timestamp: Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)] | None = Field(
-        default=None, description="Capture time in seconds; any clock that does not go backwards."
+        default=None, description="Capture time in seconds, on any clock that does not run backwards."
     )
 
 
 class EndMessage(Message):
-    """Client: no more frames; the service answers what it holds, then sends a summary and closes."""
+    """Client: no more frames follow. The service answers the frames it holds, sends a summary and closes the socket."""
+
+    example = {"type": "end"}
+    replies = ("summary",)
 
     type: Literal["end"] = "end"
 
 
 class Limits(Message):
-    """What the service accepts."""
+    """The limits of the service."""
 
-    max_bytes: int = Field(description="Bytes of one image file at most.")
-    max_pixels: int = Field(description="Pixels of one image at most.")
-    credits: int = Field(description="Mode `all`: how many frames may be unanswered at a time.")
-    frames_per_s: float = Field(description="Frames a second at most, on average.")
-    bytes_per_s: float = Field(description="Bytes a second at most, on average.")
-    idle_s: float = Field(description="A stream from which nothing comes for so long is closed.")
-    session_s: float = Field(description="A session ends for good after this time.")
-    resume_s: float = Field(description="How long after its last socket a session can be resumed.")
+    max_bytes: int = Field(description="Maximum size of an image file in bytes.")
+    max_pixels: int = Field(description="Maximum number of pixels of an image.")
+    credits: int = Field(description="Maximum number of unanswered frames in mode `all`.")
+    frames_per_s: float = Field(description="Maximum average number of frames per second.")
+    bytes_per_s: float = Field(description="Maximum average number of bytes per second.")
+    idle_s: float = Field(description="A stream that is idle for this many seconds is closed.")
+    session_s: float = Field(description="Maximum age of a session in seconds.")
+    resume_s: float = Field(description="A session can be resumed for this many seconds after its socket closed.")
 
 
 class ReadyMessage(Message):
-    """Service: the stream is open. `last_seq` is the last frame that a resumed session has answered for."""
+    """Service: the stream is open. `last_seq` is the last answered frame of a resumed session."""
 
     type: Literal["ready"] = "ready"
     session: str
-    resume_token: str = Field(description="Opens this session again; keep it as secret as a key.")
-    resumed: bool = Field(description="Whether the session goes on; false for a new one.")
+    resume_token: str = Field(description="Resumes this session; keep it as secret as an API key.")
+    resumed: bool = Field(description="Whether an earlier session continues; false for a new one.")
     last_seq: int | None
     mode: Mode
     detector: str
@@ -108,62 +127,64 @@ class ReadyMessage(Message):
 
 
 class LineModel(Message):
-    """A boundary's end points: what a straight line between its lowest and its highest row would join."""
+    """The end points of a boundary: a straight line would join its lowest and its highest row."""
 
     bottom: Point
     top: Point
 
 
 class LaneModel(Message):
-    """One tracked boundary: x(y) = v + b u + k / u with u = y - horizon and `coefficients` [v, b, k].
+    """A tracked lane boundary: x(y) = v + b u + k / u with u = y - horizon and `coefficients` [v, b, k].
 
-    It holds between the rows of `line`. On a flat road this is a parabola of the ground, seen in perspective.
+    The curve is valid between the rows of `line`. On a flat road it is a parabola on the ground, seen in perspective.
     """
 
     track_id: int
-    position: int = Field(description="-1 ego left, +1 ego right, -2 and +2 the next ones out.")
+    position: int = Field(description="-1 is ego left, +1 ego right, -2 and +2 are the next boundaries outwards.")
     state: Literal["detected", "predicted"]
     probability: float
-    points: list[Point] = Field(description="From the lowest row to the highest.")
+    points: list[Point] = Field(description="Points on the curve, from the lowest row to the highest.")
     line: LineModel
     horizon: float
     coefficients: tuple[float, float, float]
-    covariance: list[list[float]] = Field(description="3 x 3, of the coefficients.")
+    covariance: list[list[float]] = Field(description="3 x 3 covariance of the coefficients.")
     age_s: float
     ground: tuple[float, float, float] | None = Field(
         default=None,
-        description="[a, b, c] of Y = a X^2 + b X + c on the road, in metres from the camera: X forward, Y left."
+        description="[a, b, c] of Y = a X^2 + b X + c on the road, in meters from the camera: X forward, Y left."
         " Null without a camera.",
     )
 
     def x(self, y: float) -> float:
-        """The boundary's column at row `y`; nearer than one row to the horizon counts as one row."""
+        """Returns the boundary's column at row `y`. Rows less than one row below the horizon count as one row below."""
         v, b, k = self.coefficients
         u = max(y - self.horizon, 1.0)
         return v + b * u + k / u
 
 
 class EgoModel(Message):
-    """The lane the camera is in: its boundaries' track ids, and the camera's offset from the centre.
+    """The lane the camera is in: the track ids of its boundaries, and the camera's offset from the center.
 
-    The offset is a share of the lane width, positive to the right; null unless both boundaries are known. The rest is
-    there where the stream has a camera model, and told at the camera: `offset_m` and `lane_width_m` where both
-    boundaries are known, `heading` and `curvature` where one is, as the mean of those known.
+    `offset` is a fraction of the lane width, positive to the right; null unless both boundaries are known. The other
+    fields need a camera model and apply at the camera: `offset_m` and `lane_width_m` if both boundaries are known,
+    `heading` and `curvature` if at least one is, as the mean of the known ones.
     """
 
     left: int | None
     right: int | None
     offset: float | None
-    offset_m: float | None = Field(default=None, description="Metres, positive to the right of the lane's centre.")
-    lane_width_m: float | None = Field(default=None, description="Metres.")
+    offset_m: float | None = Field(default=None, description="Offset in meters, positive to the right of the center.")
+    lane_width_m: float | None = Field(default=None, description="Lane width in meters.")
     heading: float | None = Field(
-        default=None, description="Radians from the vehicle's heading to the lane's, positive to the left."
+        default=None, description="Angle from the vehicle's heading to the lane's in radians, positive to the left."
     )
-    curvature: float | None = Field(default=None, description="1/m, positive where the lane bends to the left.")
+    curvature: float | None = Field(
+        default=None, description="Curvature of the lane in 1/m, positive if it curves to the left."
+    )
 
 
 class LaneChangeModel(Message):
-    """The camera crossed a boundary."""
+    """The camera crossed a lane boundary."""
 
     type: Literal["lane_change"] = "lane_change"
     track_id: int
@@ -171,15 +192,15 @@ class LaneChangeModel(Message):
 
 
 class TimingModel(Message):
-    """Milliseconds by stage; `queue` is waiting, `total` runs from the frame's arrival to its reply."""
+    """Duration of each stage in milliseconds. `total` is their sum."""
 
-    decode: float
-    propose: float
-    queue: float
-    infer: float
-    fit: float = 0.0
-    track: float
-    total: float
+    decode: float = Field(description="Decoding the image file.")
+    propose: float = Field(description="Working image, ego-lane prior and candidates, without the networks.")
+    queue: float = Field(description="Waiting before the frame was processed.")
+    infer: float = Field(description="Waiting for the networks.")
+    fit: float = Field(default=0.0, description="Fitting curves to the paint.")
+    track: float = Field(description="The tracker.")
+    total: float = Field(description="From the frame's arrival to its reply.")
 
 
 class LanesMessage(Message):
@@ -194,12 +215,21 @@ class LanesMessage(Message):
     lanes: list[LaneModel]
     ego: EgoModel
     events: list[LaneChangeModel]
-    dropped: int = Field(description="Frames of this stream that were never processed, so far.")
+    dropped: int = Field(description="Frames of this stream that were dropped so far.")
     timing_ms: TimingModel
 
 
 class ErrorMessage(Message):
-    """Service: something was wrong. A frame's error costs that frame; a fatal one ends the stream."""
+    """Service: an error. With a `seq` it answers that frame; a fatal error ends the stream."""
+
+    example = {
+        "type": "error",
+        "code": "bad_image",
+        "message": "the JPEG image is cut short: its end is missing",
+        "hint": "send the whole file",
+        "seq": 7,
+        "fatal": False,
+    }
 
     type: Literal["error"] = "error"
     code: str
@@ -210,21 +240,25 @@ class ErrorMessage(Message):
 
 
 class DrainingMessage(Message):
-    """Service: it is about to stop. Frames that it has taken are answered, later ones refused, then the socket closes.
+    """Service: it is about to stop. It answers the frames it holds, refuses later ones, then closes the socket.
 
-    The session can be resumed on another replica, or on this one when it is back.
+    The session can be resumed on another replica, or on this one after its restart.
     """
 
+    example = {"type": "draining", "resume_token": "4Hs0...", "deadline_s": 10.0}
+
     type: Literal["draining"] = "draining"
-    resume_token: str | None = Field(description="Null where the stream was opened without `start`.")
-    deadline_s: float = Field(description="The socket is closed after so many seconds at the latest.")
+    resume_token: str | None = Field(description="Null if the stream was opened without `start`.")
+    deadline_s: float = Field(description="The socket is closed after this many seconds at the latest.")
 
 
 class SummaryMessage(Message):
-    """Service: the answer to `end`: what became of the frames that came over this socket.
+    """Service: the reply to `end` with the counts of all frames received over this socket.
 
-    `frames` counts received ones, each of them answered, failed or dropped.
+    `frames` is the number of received frames, each of which was answered, failed or dropped.
     """
+
+    example = {"type": "summary", "frames": 250, "answered": 248, "failed": 1, "dropped": 1, "duration_s": 10.02}
 
     type: Literal["summary"] = "summary"
     frames: int
@@ -234,69 +268,65 @@ class SummaryMessage(Message):
     duration_s: float
 
 
-ClientMessage = Annotated[StartMessage | FrameMessage | EndMessage, Field(discriminator="type")]
-ServerMessage = Annotated[
-    ReadyMessage | LanesMessage | ErrorMessage | DrainingMessage | SummaryMessage, Field(discriminator="type")
-]
-AnyClientMessage = StartMessage | FrameMessage | EndMessage
-AnyServerMessage = ReadyMessage | LanesMessage | ErrorMessage | DrainingMessage | SummaryMessage
+ClientMessage = StartMessage | FrameMessage | EndMessage
+ServerMessage = ReadyMessage | LanesMessage | ErrorMessage | DrainingMessage | SummaryMessage
 
-_CLIENT: Final[TypeAdapter[AnyClientMessage]] = TypeAdapter(ClientMessage)
-_SERVER: Final[TypeAdapter[AnyServerMessage]] = TypeAdapter(ServerMessage)
+_CLIENT: Final[TypeAdapter[ClientMessage]] = TypeAdapter(Annotated[ClientMessage, Field(discriminator="type")])
+_SERVER: Final[TypeAdapter[ServerMessage]] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
 
 
-def parse_client_message(text: str) -> AnyClientMessage:
-    """The client message in `text`. Raises ProtocolError with one line that says what was wrong."""
+def parse_client_message(text: str) -> ClientMessage:
+    """Returns the client message in `text`. Raises ProtocolError if it is malformed."""
     try:
         return _CLIENT.validate_json(text)
     except ValidationError as error:
         raise ProtocolError(
-            f"not a stream message: {_first_problem(error)}",
-            'send a text message like {"type": "start"|"frame"|"end", ...} or a binary message with an image file',
+            f"not a valid stream message: {_first_problem(error)}",
+            'send a text message like {"type": "start"|"frame"|"end", ...}, or an image file as a binary message',
         ) from None
 
 
-def parse_server_message(text: str) -> AnyServerMessage:
-    """The service message in `text`. Raises ProtocolError where it is none."""
+def parse_server_message(text: str) -> ServerMessage:
+    """Returns the service message in `text`. Raises ProtocolError if it is malformed."""
     try:
         return _SERVER.validate_json(text)
     except ValidationError as error:
-        raise ProtocolError(f"the service sent something unknown: {_first_problem(error)}") from None
+        raise ProtocolError(f"the service sent an invalid message: {_first_problem(error)}") from None
 
 
-def camera_of(height: float | None, field_of_view: float | None) -> CameraModel | None:
-    """The camera of two options that go together; None without both. Raises ProtocolError for a half or a bad one."""
+def parse_camera(height: float | None, field_of_view: float | None) -> CameraModel | None:
+    """Returns the camera of two options that belong together; None if both are None. Raises ProtocolError otherwise."""
     if height is None and field_of_view is None:
         return None
     try:
         return CameraModel.model_validate({"height": height, "field_of_view": field_of_view})
     except ValidationError as error:
         raise ProtocolError(
-            f"not a camera: {_first_problem(error)}",
-            "give both its height, 0.3 to 4 m, and its horizontal field of view, 20 to 150 degrees, or neither",
+            f"not a valid camera: {_first_problem(error)}",
+            "give both the height (0.3 to 4 m) and the horizontal field of view (20 to 150 degrees), or neither",
         ) from None
 
 
 def error_message(error: BaseException, *, seq: int | None = None, fatal: bool = False) -> ErrorMessage:
-    """How `error` is told. Nothing of an error that was not raised on purpose is told: it is in the service's log."""
+    """Returns the message that reports `error`. Details of an unexpected error appear only in the service's log."""
     if isinstance(error, LanestreamError):
         return ErrorMessage(code=error.code, message=error.message, hint=error.hint, seq=seq, fatal=fatal)
     return ErrorMessage(
         code=LanestreamError.code,
-        message="something went wrong in the service",
-        hint="see its log",
+        message="an unexpected error occurred in the service",
+        hint="see the log of the service",
         seq=seq,
         fatal=fatal,
     )
 
 
-def schemas() -> dict[str, dict[str, Any]]:
-    """JSON Schemas of the messages that a client sends and of those that the service sends."""
+def json_schemas() -> dict[str, dict[str, Any]]:
+    """Returns the JSON Schemas of the messages that the client sends and that the service sends."""
     return {"client": _CLIENT.json_schema(), "server": _SERVER.json_schema(mode="serialization")}
 
 
 def _first_problem(error: ValidationError) -> str:
     problem = error.errors(include_url=False, include_input=False)[0]
-    # Both may quote what was sent, however long that is.
-    where, why = one_line(".".join(map(str, problem["loc"])), 80), one_line(problem["msg"])
-    return f"{where}: {why}" if where else why
+    # Both may quote what was sent, at any length.
+    location, reason = one_line(".".join(map(str, problem["loc"])), 80), one_line(problem["msg"])
+    return f"{location}: {reason}" if location else reason

@@ -1,6 +1,6 @@
-"""What can be set about the service: on the command line, by environment variables LANESTREAM_..., or in a TOML file.
+"""The settings of the service: from the command line, from environment variables LANESTREAM_..., or from a TOML file.
 
-Of what is set in more than one place the command line counts first, then the environment, then the file.
+The command line takes precedence over the environment, and the environment over the file.
 """
 
 from __future__ import annotations
@@ -35,118 +35,135 @@ if TYPE_CHECKING:
 _PREFIX: Final = "LANESTREAM_"
 _ORIGIN: Final = re.compile(r"[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 _MASK: Final = "***"
-# Where a URL may have a password: before its host, or among its parameters.
+# The parts of a URL that may contain a password: before the host, or in the query.
 _URL_SECRETS: Final = re.compile(r"(?<=://)[^/\s]+(?=@)|(?<=\?).+")
 
 
 def _keys(value: object) -> object:
-    """The keys in a text of them, separated by commas or lines, or in a list of such texts."""
-    return parse_keys(_texts(value), "entry") if value else ()
+    """Returns the keys in a string, separated by commas or lines, or in a list of such strings."""
+    return parse_keys(_split(value), "entry") if value else ()
 
 
 def _origins(value: object) -> object:
-    """The origins in a text of them, separated by commas or lines, or in a list of such texts."""
-    origins = tuple(text.lower() for text in _texts(value) if text)
+    """Returns the origins in a string, separated by commas or lines, or in a list of such strings."""
+    origins = tuple(text.lower() for text in _split(value) if text)
     for origin in origins:
         if not _ORIGIN.fullmatch(origin):
-            raise ValueError(f"{origin!r} is no origin; scheme://host or scheme://host:port is accepted")
+            raise ValueError(f"{origin!r} is not a valid origin; expected scheme://host or scheme://host:port")
     return tuple(_without_default_port(origin) for origin in origins)
 
 
 def _without_default_port(origin: str) -> str:
-    """The origin as browsers tell it."""
+    """Returns the origin as browsers send it, without the default port of its scheme."""
     for scheme, port in (("http://", ":80"), ("https://", ":443")):
         if origin.startswith(scheme):
             return origin.removesuffix(port)
     return origin
 
 
-def _texts(value: object) -> list[str]:
-    given = value if isinstance(value, list | tuple) else [value]
-    texts = [text for text in given if isinstance(text, str)]
-    if len(texts) < len(given):
-        raise ValueError("a text or a list of texts is accepted")
+def _split(value: object) -> list[str]:
+    """Returns the parts of a string, or of a list of strings, separated by commas or lines."""
+    values = value if isinstance(value, list | tuple) else [value]
+    texts = [text for text in values if isinstance(text, str)]
+    if len(texts) < len(values):
+        raise ValueError("expected a string or a list of strings")
     return [part.strip() for text in texts for line in text.splitlines() for part in line.split(",")]
 
 
 class Settings(BaseSettings):
-    """The service's settings; each is read from LANESTREAM_<NAME>, or by its name from the file that `config` names."""
+    """The settings of the service. Each is read from LANESTREAM_<NAME>, or by its name from the file `config`."""
 
     model_config = SettingsConfigDict(
         env_prefix=_PREFIX, env_ignore_empty=True, frozen=True, extra="forbid", hide_input_in_errors=True
     )
 
-    config: Path | None = Field(default=None, description="TOML file with settings; it can't name another one.")
+    config: Path | None = Field(default=None, description="TOML file with settings.")
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
-    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
-    model: Path | None = Field(default=None, description="ONNX file of the network; the shipped one where absent.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 selects a free one.")
+    model: Path | None = Field(default=None, description="ONNX file of the network; the shipped one if not set.")
     regressor: Path | None = Field(
-        default=None, description="ONNX file of the second network, or `none`; the shipped one where absent."
+        default=None, description="ONNX file of the regressor, or `none`; the shipped one if not set."
     )
-    provider: Provider = Field(default="auto", description="Where the networks run.")
+    provider: Provider = Field(default="auto", description="Execution provider of the networks.")
     inference_threads: int | None = Field(
         default=None,
         ge=1,
         le=256,
-        description="Threads of one network's run on the CPU; if absent 1, or half of the processors in one process.",
+        description="CPU threads for one run of a network; if not set, 1, or half of the processors with a single "
+        "process.",
     )
-    tensorrt_cache: Path | None = Field(default=None, description="Folder where TensorRT keeps the engines it builds.")
-    max_bytes: int = Field(default=8 << 20, ge=1024, le=1 << 28, description="Bytes of one image file at most.")
-    max_pixels: int = Field(default=4096 * 2304, ge=1 << 16, le=MOST_PIXELS, description="Pixels of one image at most.")
-    max_sessions: int = Field(default=64, ge=1, description="Streams and single images at a time at most.")
+    tensorrt_cache: Path | None = Field(default=None, description="Folder where TensorRT caches the engines it builds.")
+    max_bytes: int = Field(default=8 << 20, ge=1024, le=1 << 28, description="Maximum size of an image file in bytes.")
+    max_pixels: int = Field(
+        default=4096 * 2304, ge=1 << 16, le=MOST_PIXELS, description="Maximum number of pixels of an image."
+    )
+    max_sessions: int = Field(default=64, ge=1, description="Maximum number of concurrent streams and single images.")
     max_sessions_per_caller: int | None = Field(
-        default=None, ge=1, description="Sessions of one key, or of one host without keys, at a time at most."
+        default=None, ge=1, description="Maximum number of concurrent sessions per key, or per host without keys."
     )
-    credits: int = Field(default=8, ge=1, le=256, description="Unanswered frames of a stream in mode `all` at most.")
-    frames_per_s: float = Field(default=240.0, gt=0.0, description="Frames a second of a stream at most, on average.")
-    bytes_per_s: float = Field(default=256e6, gt=0.0, description="Bytes a second of a stream at most, on average.")
+    credits: int = Field(
+        default=8, ge=1, le=256, description="Maximum number of unanswered frames of a stream in mode `all`."
+    )
+    frames_per_s: float = Field(
+        default=240.0, gt=0.0, description="Maximum average number of frames per second of a stream."
+    )
+    bytes_per_s: float = Field(
+        default=256e6, gt=0.0, description="Maximum average number of bytes per second of a stream."
+    )
     frame_deadline_s: float = Field(
-        default=2.0, gt=0.0, description="In mode `latest` a frame that waited so long is dropped."
+        default=2.0, gt=0.0, description="In mode `latest`, a frame that waited this many seconds is dropped."
     )
     handshake_s: float = Field(
         default=10.0,
         gt=0.0,
-        description="The head of a request, and the first message of a stream, come within this time.",
+        description="Time limit in seconds for the head of a request, and for the first message of a stream.",
     )
-    body_s: float = Field(default=30.0, gt=0.0, description="A single image has to come within this time.")
-    idle_s: float = Field(default=60.0, gt=0.0, description="A stream from which nothing comes for so long is closed.")
-    session_s: float = Field(default=86_400.0, gt=0.0, description="A session's longest life, over all its sockets.")
-    resume_s: float = Field(default=60.0, ge=1.0, description="A session can be resumed so long after its last socket.")
-    drain_s: float = Field(default=10.0, ge=0.0, description="Before a stop, frames are answered for so long at most.")
+    body_s: float = Field(default=30.0, gt=0.0, description="Time limit in seconds for the body of a single request.")
+    idle_s: float = Field(default=60.0, gt=0.0, description="A stream that is idle for this many seconds is closed.")
+    session_s: float = Field(
+        default=86_400.0, gt=0.0, description="Maximum age of a session in seconds, over all its sockets."
+    )
+    resume_s: float = Field(
+        default=60.0, ge=1.0, description="A session can be resumed for this many seconds after its socket closed."
+    )
+    drain_s: float = Field(
+        default=10.0, ge=0.0, description="Before a stop, frames are answered for at most this many seconds."
+    )
     redis_url: SecretStr | None = Field(
         default=None,
-        description="Redis that keeps sessions for all replicas, redis://host:6379/0; in memory if absent.",
+        description="Redis that stores sessions for all replicas, redis://host:6379/0; in memory if not set.",
     )
     processes: int | None = Field(
         default=None,
         ge=0,
         le=64,
-        description="Processes that work on frames, 0 for the service's own alone; if absent one for each processor, "
-        "8 at most and no more than there is memory for, and one where a GPU runs the networks.",
+        description="Worker processes, or 0 to process frames in the service's own; if not set, one per processor, at "
+        "most 8 and as many as fit into memory, and one if a GPU runs the networks.",
     )
     threads: int | None = Field(
         default=None,
         ge=1,
         le=256,
-        description="Frames that each process has in work at a time, a thread each; if absent 1, or in one process one "
-        "more than there are processors.",
+        description="Frames that each process handles concurrently, one thread each; if not set, 1, or one more than "
+        "there are processors with a single process.",
     )
-    opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV takes for one image.")
+    opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV uses for one image.")
 
     api_keys: Annotated[tuple[ApiKey, ...], NoDecode, BeforeValidator(_keys)] = Field(
-        default=(), description="API keys as `lanestream key NAME` prints them, NAME:SHA256; without any, all may come."
+        default=(),
+        description="API keys as printed by `lanestream key NAME`, NAME:SHA256; without any, every caller is accepted.",
     )
-    api_keys_file: Path | None = Field(default=None, description="File with more of them, one a line.")
+    api_keys_file: Path | None = Field(default=None, description="File with further API keys, one per line.")
     allowed_origins: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)] = Field(
-        default=(), description="Origins of web pages that may use the service, beside its own: https://example.com."
+        default=(), description="Origins of other web pages that may use the service, such as https://example.com."
     )
     metrics_access: Literal["keys", "open", "off"] = Field(
-        default="keys", description="Who may read /metrics: those with a key, everybody, nobody."
+        default="keys", description="Who may read /metrics: `keys` callers with a key, `open` everyone, `off` no one."
     )
-    log_format: Literal["text", "json"] = Field(default="text", description="Form of a line in the log.")
+    log_format: Literal["text", "json"] = Field(default="text", description="Format of log records.")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="The least that is logged."
+        default="info", description="Lowest level that is logged."
     )
 
     @classmethod
@@ -158,23 +175,23 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
         file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Where settings come from, the first counts."""
+        """Returns the sources of settings, in order of precedence."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
 
     @property
     def runtime_options(self) -> RuntimeOptions:
-        """How the networks run."""
-        # In one process a run leaves room for the frames beside it; among several each has its own processor.
-        usual = network_threads() if self.processes in (0, 1) else 1
-        return RuntimeOptions(self.inference_threads or usual, self.tensorrt_cache)
+        """The runtime options of the networks."""
+        # A single process leaves processors to the other stages of frames; several processes have one processor each.
+        default = network_threads() if self.processes in (0, 1) else 1
+        return RuntimeOptions(self.inference_threads or default, self.tensorrt_cache)
 
-    def threads_of(self, processes: int) -> int:
-        """Frames in work at a time in each of so many processes."""
+    def threads_per_process(self, processes: int) -> int:
+        """Returns the number of frames that each of `processes` processes handles concurrently."""
         return self.threads or (1 if processes > 1 else processors() + 1)
 
     @property
     def session_limits(self) -> SessionLimits:
-        """How many sessions there may be, and for how long."""
+        """The limits of all sessions."""
         return SessionLimits(
             sessions=self.max_sessions,
             sessions_per_caller=self.max_sessions_per_caller,
@@ -185,7 +202,7 @@ class Settings(BaseSettings):
 
     @property
     def stream_limits(self) -> StreamLimits:
-        """What one stream may do."""
+        """The limits of one stream."""
         return StreamLimits(
             credits=self.credits,
             frames_per_s=self.frames_per_s,
@@ -201,86 +218,85 @@ class Settings(BaseSettings):
         return ImageLimits(max_bytes=self.max_bytes, max_pixels=self.max_pixels)
 
 
-def load_settings(**given: object) -> Settings:
-    """Settings as `given` on the command line (None counts as not given), else from the environment, else from a file.
+def load_settings(**options: object) -> Settings:
+    """Returns the settings from command-line `options` (None means not given), the environment and the file `config`.
 
-    The file is the one that the setting `config` names. Raises SettingsError with one line that names the option, the
-    variable or the key in the file, and shows no secret.
+    Raises SettingsError on one line that names the option, the variable or the key in the file, and shows no secret.
     """
-    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    named = chosen.get("config") or os.environ.get(f"{_PREFIX}CONFIG")
-    path = None if named is None or named == "" else Path(str(named))
-    keys = {} if path is None else _read(path)
+    given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
+    config = given.get("config") or os.environ.get(f"{_PREFIX}CONFIG")
+    path = None if config is None or config == "" else Path(str(config))
+    file_values = {} if path is None else _read_toml(path)
 
-    class Configured(Settings):
-        """The settings, with this file behind them."""
+    class FileSettings(Settings):
+        """Settings that are also read from this file."""
 
         model_config = SettingsConfigDict(toml_file=path)
 
     try:
-        return Settings.model_construct(**dict(Configured(**chosen)))
+        return Settings.model_construct(**dict(FileSettings(**given)))
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         name = str(problem["loc"][0])
-        if name in chosen:
+        if name in given:
             label = f"--{name.replace('_', '-')}"
-        elif name in keys and not os.environ.get(_PREFIX + name.upper()):
+        elif name in file_values and not os.environ.get(_PREFIX + name.upper()):
             label = f"{path}: {name}"
         else:
             label = _PREFIX + name.upper()
-        raise _told(label, problem) from None
+        raise _settings_error(label, problem) from None
 
 
-def shown(settings: Settings) -> str:
-    """The settings as a TOML file, one a line, without the secrets in them; what is not set is a comment."""
-    lines = (_line(name, getattr(settings, name)) for name in type(settings).model_fields)
+def to_toml(settings: Settings) -> str:
+    """Returns the settings as TOML, one per line, with secrets masked. Settings without a value are comments."""
+    lines = (_toml_line(name, getattr(settings, name)) for name in type(settings).model_fields)
     return "\n".join(lines)
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """The keys and values of a TOML file. Raises SettingsError where it is none."""
+def _read_toml(path: Path) -> dict[str, Any]:
+    """Returns the keys and values of a TOML file. Raises SettingsError if it can't be read or is not valid."""
     try:
         with path.open("rb") as file:
             values = tomllib.load(file)
     except OSError as error:
         raise SettingsError(
-            f"can't read {path}: {(error.strerror or str(error)).lower()}", "see --config and LANESTREAM_CONFIG"
+            f"can't read {path}: {(error.strerror or str(error)).lower()}", "check --config and LANESTREAM_CONFIG"
         ) from None
     except UnicodeDecodeError:
-        raise SettingsError(f"{path} is no text", "give a TOML file") from None
+        raise SettingsError(f"{path} is not a UTF-8 text file", "use a TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(
-            f"{path} is no TOML: {_sentence(str(error))}", 'write a setting as `name = "value"`'
+            f"{path} is not valid TOML: {_lower_first(str(error))}", 'write a setting as `name = "value"`'
         ) from None
     if "config" in values:
-        raise SettingsError(f"{path}: config can't be set in the file", "give one file, with --config")
+        raise SettingsError(f"{path}: a settings file can't set config", "use one file, named by --config")
     return values
 
 
-def _told(label: str, problem: ErrorDetails) -> SettingsError:
+def _settings_error(label: str, problem: ErrorDetails) -> SettingsError:
     if problem["type"] == "extra_forbidden":
-        return SettingsError(f"{label} is no setting", "`lanestream serve --print-config` prints all there are")
-    message = _sentence(problem["msg"].removeprefix("Value error, "))
-    return SettingsError(f"{label}{_value(problem)}: {message}")
+        return SettingsError(f"{label} is not a setting", "`lanestream serve --print-config` lists all settings")
+    message = _lower_first(problem["msg"].removeprefix("Value error, "))
+    return SettingsError(f"{label}{_input(problem)}: {message}")
 
 
-def _value(problem: ErrorDetails) -> str:
-    """What was given, where it may be seen."""
+def _input(problem: ErrorDetails) -> str:
+    """Returns the rejected value for an error message; nothing for a secret."""
     annotation = Settings.model_fields[str(problem["loc"][0])].annotation
     secret = {annotation, *get_args(annotation)} & {SecretStr, ApiKey}
     return "" if secret else f" = {problem['input']!r}"
 
 
-def _line(name: str, value: object) -> str:
+def _toml_line(name: str, value: object) -> str:
     if value is None:
         return f"# {name} is not set"
     return f"{name} = {json.dumps(_plain(value), ensure_ascii=False)}"
 
 
 def _plain(value: object) -> object:
-    """A value as TOML and JSON both write it, without its secrets."""
+    """Returns a value that JSON writes as TOML does, with secrets masked."""
     if isinstance(value, tuple):
-        return [_plain(each) for each in value]
+        return [_plain(item) for item in value]
     if isinstance(value, ApiKey):
         return f"{value.name}:{_MASK}"
     if isinstance(value, SecretStr):
@@ -288,5 +304,5 @@ def _plain(value: object) -> object:
     return str(value) if isinstance(value, Path) else value
 
 
-def _sentence(message: str) -> str:
+def _lower_first(message: str) -> str:
     return message[:1].lower() + message[1:]

@@ -307,7 +307,7 @@ def test_an_invalid_url_is_reported_without_its_password(run: Run, monkeypatch: 
     monkeypatch.setenv("LANESTREAM_REDIS_URL", "redis://:secret/word@host:6379")
     code, _, errors = run("serve", "--port", "0")
     assert (code, errors.count("\n")) == (1, 1)
-    assert errors.startswith("error: the URL of Redis is none (")
+    assert errors.startswith("error: redis_url is not a valid Redis URL (")
     assert "secret" not in errors
 
 

@@ -15,10 +15,10 @@ from websockets.exceptions import ConnectionClosed
 
 from lanestream.errors import ProtocolError
 from lanestream.protocol import (
-    AnyServerMessage,
     EndMessage,
     ErrorMessage,
     LanesMessage,
+    ServerMessage,
     SummaryMessage,
     parse_client_message,
     parse_server_message,
@@ -82,7 +82,7 @@ images = st.one_of(
 class Heard:
     """What came back over a stream, and the code that it was closed with; 0 where it was just dropped."""
 
-    told: list[AnyServerMessage] = field(default_factory=list)
+    told: list[ServerMessage] = field(default_factory=list)
     code: int = 0
 
     @property

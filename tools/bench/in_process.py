@@ -51,14 +51,14 @@ def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
     load = partial(load_engine, provider=provider, options=settings.runtime_options)
     engine = load()
     processes = settings.processes or usual_processes(Capabilities.of(engine.pipelines))
-    threads = processes * settings.threads_of(processes)
+    threads = processes * settings.threads_per_process(processes)
     network = engine.network
     patches = patches_per_frame(engine, clips[max(clips)])
     with ThreadPoolExecutor(1) as worker, asyncio.Runner() as loop:
         setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
         pools: dict[str, WorkerPool] = {
             PIPELINE: ThreadPool(engine, settings.image_limits, threads),
-            POOL: worker.submit(loop.run, ProcessPool.started(setup, processes, settings.threads_of)).result(),
+            POOL: worker.submit(loop.run, ProcessPool.started(setup, processes, settings.threads_per_process)).result(),
         }
         pipe.send(PipelineInfo(processes, threads // processes, network.name, network.provider, patches))
         while True:

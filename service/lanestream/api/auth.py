@@ -1,6 +1,6 @@
-"""Who may come in: API keys, and for browsers the page that they come from. Asked before any work is done.
+"""Authentication: API keys, and for browsers the origin of the page. Checked before any work is done.
 
-Routes are guarded by what they are, never by how their path reads: a request can't be spelled past the guard.
+Each route declares its guard itself; nothing depends on how a path is spelled, so no spelling of a path evades it.
 """
 
 from __future__ import annotations
@@ -15,94 +15,96 @@ from urllib.parse import urlsplit
 from starlette.requests import HTTPConnection
 
 from lanestream.errors import ForbiddenError, UnauthorizedError
-from lanestream.keys import ApiKey, find, read_keys
+from lanestream.keys import ApiKey, find_key, read_keys
 from lanestream.protocol import KEY_SUBPROTOCOL
-from lanestream.streaming.caller import ANONYMOUS, Caller
+from lanestream.streaming.session_registry import Caller
 
 if TYPE_CHECKING:
     from lanestream.settings import Settings
 
 _log = logging.getLogger(__name__)
 
+_ANONYMOUS: Final = "anonymous"
 _SCHEME: Final = "bearer"
-_HOW: Final = "send the header `Authorization: Bearer KEY`, or from a browser offer the subprotocol `bearer.KEY`"
+_HOW: Final = "send the header `Authorization: Bearer KEY`; from a browser, offer the subprotocol `bearer.KEY`"
 _PORTS: Final = {"http": 80, "https": 443}
 
 
 @dataclass(frozen=True)
 class Authenticator:
-    """Lets callers in. Without `keys` everybody may come; `origins` are the web pages that may, beside our own."""
+    """Identifies callers. Without `keys` every caller is accepted; `origins` are the allowed foreign web origins."""
 
     keys: Sequence[ApiKey] = ()
     origins: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, settings: Settings) -> Self:
-        """The authenticator that the settings ask for. Raises SettingsError where the file of keys can't be used."""
-        listed = read_keys(settings.api_keys_file) if settings.api_keys_file is not None else ()
-        return cls((*settings.api_keys, *listed), frozenset(settings.allowed_origins))
+    def from_settings(cls, settings: Settings) -> Self:
+        """Returns the authenticator for these settings. Raises SettingsError if the file of API keys can't be used."""
+        from_file = read_keys(settings.api_keys_file) if settings.api_keys_file is not None else ()
+        return cls((*settings.api_keys, *from_file), frozenset(settings.allowed_origins))
 
-    def admit(self, connection: HTTPConnection) -> Caller:
-        """The caller behind a request or a WebSocket that is not accepted yet.
+    def authenticate(self, connection: HTTPConnection) -> Caller:
+        """Returns the caller behind a request, or behind a WebSocket that is not accepted yet.
 
-        Raises ForbiddenError where it comes from a web page of a foreign origin, and UnauthorizedError where it comes
-        without a key or with a wrong one.
+        Raises ForbiddenError for a web page of a foreign origin, and UnauthorizedError for a missing or unknown key.
         """
         self._check_origin(connection)
         if not self.keys:
-            return Caller(ANONYMOUS, connection.client.host if connection.client else ANONYMOUS)
+            return Caller(_ANONYMOUS, connection.client.host if connection.client else _ANONYMOUS)
         token = _token(connection)
         if token is None:
-            raise UnauthorizedError("an API key is needed", _HOW)
-        key = find(self.keys, token)
+            raise UnauthorizedError("an API key is required", _HOW)
+        key = find_key(self.keys, token)
         if key is None:
-            raise UnauthorizedError("this API key is not known", "ask whoever runs the service for one")
+            raise UnauthorizedError("this API key is unknown", "ask the operator of the service for a key")
         return Caller(key.name, key.name)
 
     def _check_origin(self, connection: HTTPConnection) -> None:
-        """Browsers tell the page's origin, and let no page tell another; what is no browser mostly tells none."""
+        """Raises ForbiddenError for a foreign origin. Browsers send the page's origin; programs usually send none."""
         origin = connection.headers.get("origin")
-        if origin is None or origin in self.origins or self._is_ours(origin, connection.headers.get("host", "")):
+        if origin is None or origin in self.origins or self._is_own(origin, connection.headers.get("host", "")):
             return
         raise ForbiddenError(
-            "web pages of this origin may not use the service", "add the origin to LANESTREAM_ALLOWED_ORIGINS"
+            "web pages of this origin are not allowed to use the service",
+            "add the origin to LANESTREAM_ALLOWED_ORIGINS",
         )
 
-    def _is_ours(self, origin: str, host: str) -> bool:
-        """Whether a page of this origin came from us; `host` is what its browser calls us, with the port."""
-        # Only the page knows whether a proxy in front of us speaks TLS, and with that which port goes without saying.
+    def _is_own(self, origin: str, host: str) -> bool:
+        """Returns whether the service itself served a page of `origin`; `host` is the request's Host header."""
+        # A proxy may terminate TLS, so only the page knows the scheme, which implies the default port.
         scheme = origin.partition("://")[0]
-        place = _place(origin)
-        if place is None or place != _place(f"{scheme}://{host}"):
+        address = _address(origin)
+        if address is None or address != _address(f"{scheme}://{host}"):
             return False
-        # Whoever owns a name can have it lead to us after a browser has loaded their page by it (DNS rebinding). Nobody
-        # can do that to an address; and where keys are asked for, their page has none.
-        return bool(self.keys) or _is_fixed(place[0])
+        # DNS rebinding: the owner of a host name can point it at this service after a browser has loaded their page.
+        # That works neither for IP addresses nor when keys are required, since their page has no key.
+        return bool(self.keys) or _is_fixed(address[0])
 
 
 def warn_if_open(authenticator: Authenticator, host: str, *, loopback: bool) -> None:
-    """Says loudly that everybody who can reach `host` may use the service, where that is so."""
+    """Logs a warning if everyone who can reach `host` may use the service."""
     if not authenticator.keys and not loopback:
         _log.warning(
-            "NO API KEYS: everybody who can reach %s may use this service. Make a key with `lanestream key NAME`"
+            "NO API KEYS: everyone who can reach %s may use this service. Create a key with `lanestream key NAME`"
             " and set LANESTREAM_API_KEYS, or listen on 127.0.0.1",
             host,
         )
 
 
 def _token(connection: HTTPConnection) -> str | None:
+    """Returns the key in the Authorization header, or if that header is missing, in a subprotocol."""
     header = connection.headers.get("authorization")
     if header is not None:
         scheme, _, token = header.strip().partition(" ")
         return token.strip() if scheme.lower() == _SCHEME else None
-    for offered in connection.scope.get("subprotocols", ()):
-        if offered.startswith(KEY_SUBPROTOCOL):
-            return str(offered).removeprefix(KEY_SUBPROTOCOL)
+    for subprotocol in connection.scope.get("subprotocols", ()):
+        if subprotocol.startswith(KEY_SUBPROTOCOL):
+            return str(subprotocol).removeprefix(KEY_SUBPROTOCOL)
     return None
 
 
-def _place(url: str) -> tuple[str, int | None] | None:
-    """The host and the port of a URL; None where it names no host."""
+def _address(url: str) -> tuple[str, int | None] | None:
+    """Returns the host and port of a URL; None if it has no host."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme)
@@ -112,7 +114,7 @@ def _place(url: str) -> tuple[str, int | None] | None:
 
 
 def _is_fixed(host: str) -> bool:
-    """Whether no name service decides where this host is."""
+    """Returns whether `host` is resolved without DNS."""
     if host == "localhost":
         return True
     try:

@@ -1,4 +1,4 @@
-"""HTTP connections on which nobody says anything: uvicorn would hold them for ever."""
+"""A time limit for the head of an HTTP request. uvicorn has none and would keep a silent connection open forever."""
 
 from __future__ import annotations
 
@@ -7,61 +7,61 @@ from typing import TYPE_CHECKING, Final
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-_ANSWER: Final = b"HTTP/1.1 408 Request Timeout\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
+_TIMEOUT_RESPONSE: Final = b"HTTP/1.1 408 Request Timeout\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
 
 if TYPE_CHECKING:
-    # What uvicorn does not annotate.
-    class _Http(HttpToolsProtocol):
+    # uvicorn does not annotate this class.
+    class _HttpProtocol(HttpToolsProtocol):
         def __init__(self, *arguments: object, **named: object) -> None: ...
 else:
-    _Http = HttpToolsProtocol
+    _HttpProtocol = HttpToolsProtocol
 
 
-class PunctualHttp(_Http):
-    """HTTP/1.1 with a limit to how long the head of a request may take, from the connection or from its first byte.
+class HeaderTimeoutProtocol(_HttpProtocol):
+    """HTTP/1.1 whose request heads must be complete `head_s` seconds after the connection or after their first byte.
 
-    Bodies have a limit of their own, and connections between two requests have uvicorn's.
+    Request bodies have their own limit, and uvicorn closes connections that are idle between two requests.
     """
 
     head_s: float
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """A client came: it has to say what it wants."""
+        """Starts the timer for the first request."""
         super().connection_made(transport)
-        self._due: asyncio.TimerHandle | None = None
-        self._expect()
+        self._timer: asyncio.TimerHandle | None = None
+        self._start_timer()
 
     def on_message_begin(self) -> None:
-        """A head begins."""
+        """Starts the timer for a further request."""
         super().on_message_begin()
-        self._expect()
+        self._start_timer()
 
     def on_headers_complete(self) -> None:
-        """A head is there."""
-        self._forget()
+        """Stops the timer: the head is complete."""
+        self._stop_timer()
         super().on_headers_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The client is gone."""
-        self._forget()
+        """Stops the timer: the client is gone."""
+        self._stop_timer()
         super().connection_lost(exc)
 
-    def _expect(self) -> None:
-        if self._due is None:
-            self._due = self.loop.call_later(self.head_s, self._give_up)
+    def _start_timer(self) -> None:
+        if self._timer is None:
+            self._timer = self.loop.call_later(self.head_s, self._time_out)
 
-    def _forget(self) -> None:
-        if self._due is not None:
-            self._due.cancel()
-            self._due = None
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
-    def _give_up(self) -> None:
-        # The answer to an earlier request is no place for another one.
+    def _time_out(self) -> None:
+        # Never write into the response to an earlier, pipelined request.
         if self.cycle is None or self.cycle.response_complete:
-            self.transport.write(_ANSWER)
+            self.transport.write(_TIMEOUT_RESPONSE)
         self.transport.close()
 
 
-def punctual(head_s: float) -> type[PunctualHttp]:
-    """The protocol with this limit, in seconds."""
-    return type("PunctualHttp", (PunctualHttp,), {"head_s": head_s})
+def with_header_timeout(head_s: float) -> type[HeaderTimeoutProtocol]:
+    """Returns the protocol class with a limit of `head_s` seconds; uvicorn creates the instances."""
+    return type("HeaderTimeoutProtocol", (HeaderTimeoutProtocol,), {"head_s": head_s})

@@ -1,14 +1,17 @@
-"""What is counted and measured of the service, for Prometheus: base units, reasons as labels, one registry per app."""
+"""Prometheus metrics of the service, in base units, with one registry per application."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, PlatformCollector, ProcessCollector
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Metric, PlatformCollector, ProcessCollector
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
+from prometheus_client.registry import Collector
 
-from lanestream.api.worker_metrics import WorkerCollector
 from lanestream.errors import (
     BusyError,
     DrainingError,
@@ -29,7 +32,7 @@ ResumeResult = Literal["resumed", "unknown", "refused"]
 
 MEDIA_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
-# Why a frame that was received got no lanes, by the code of its error; of any other code: `error`.
+# Why a received frame was not answered with lanes, by the code of its error. Any other code counts as `error`.
 _DROP_REASONS: Final[Mapping[str, DropReason]] = {
     ImageError.code: "decode_error",
     ImageTooLargeError.code: "too_large",
@@ -40,7 +43,7 @@ _DROP_REASONS: Final[Mapping[str, DropReason]] = {
     DrainingError.code: "overload",
 }
 _ON_GPU: Final = frozenset({"cuda", "tensorrt"})
-# The sum of all stages, which is none of them.
+# The sum of the stages in `timing_ms`; not a stage itself.
 _TOTAL: Final = "total"
 
 _STAGE_BUCKETS: Final = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512, 1.0, 2.0)
@@ -55,111 +58,148 @@ class Metrics:
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         PlatformCollector(registry=self._registry)
-        self._received = self._counter("lane_frames_received_total", "Frames that came, streamed or single.")
-        self._processed = self._counter("lane_frames_processed_total", "Frames that were answered with lanes.")
-        self._dropped = self._counter("lane_frames_dropped_total", "Frames that came and got no lanes.", "reason")
-        self._refusals = self._counter("lane_refusals_total", "Errors that clients were told.", "code")
+        self._received = self._counter("lane_frames_received_total", "Frames received, streamed or single.")
+        self._processed = self._counter("lane_frames_processed_total", "Frames answered with lanes.")
+        self._dropped = self._counter(
+            "lane_frames_dropped_total", "Frames received and not answered with lanes.", "reason"
+        )
+        self._refusals = self._counter("lane_refusals_total", "Errors sent to clients.", "code")
         self._resumed = self._counter("lane_sessions_resumed_total", "Attempts to resume a session.", "result")
-        self._closes = self._counter("lane_ws_closes_total", "WebSockets that were closed, by close code.", "code")
-        self._sessions = self._gauge("lane_sessions_active", "Streams that have a session.")
+        self._closes = self._counter("lane_ws_closes_total", "WebSockets closed, by close code.", "code")
+        self._sessions = self._gauge("lane_sessions_active", "Streams with a session.")
         self._tasks = self._gauge("lane_tasks", "Tasks of the event loop.")
-        self._queue = self._gauge("lane_queue_depth", "Questions that waited on when the last batch began.")
+        self._queue = self._gauge("lane_queue_depth", "Inference requests still waiting when the last batch started.")
         self._provider = self._gauge(
-            "lane_inference_provider_info", "What runs a network.", "network", "provider", "device", "precision"
+            "lane_inference_provider_info",
+            "The execution provider of a network.",
+            "network",
+            "provider",
+            "device",
+            "precision",
         )
         self._fallback = self._gauge(
-            "lane_provider_fallback", "1 where a better provider is installed and can't be used.", "network"
+            "lane_provider_fallback", "1 if a better provider is installed but can't be used.", "network"
         )
-        self._model = self._gauge("lane_model_info", "The file of a network.", "name", "version", "sha256")
+        self._model = self._gauge("lane_model_info", "The model file of a network.", "name", "version", "sha256")
         self._stages = self._histogram(
-            "lane_stage_seconds", "Time of the stages of an answered frame.", _STAGE_BUCKETS, "stage"
+            "lane_stage_seconds", "Duration of the stages of an answered frame.", _STAGE_BUCKETS, "stage"
         )
-        self._age = self._histogram("lane_frame_age_seconds", "From a frame's arrival to its lanes.", _AGE_BUCKETS)
-        self._batch_size = self._histogram(
-            "lane_batch_size", "Inputs that a network took at once.", _BATCH_BUCKETS, "network"
+        self._age = self._histogram(
+            "lane_frame_age_seconds", "Time from a frame's arrival to its answer.", _AGE_BUCKETS
         )
+        self._batch_size = self._histogram("lane_batch_size", "Inputs in a batch.", _BATCH_BUCKETS, "network")
         self._batch_wait = self._histogram(
-            "lane_batch_wait_seconds", "How long the oldest question of a batch had waited.", _STAGE_BUCKETS, "network"
+            "lane_batch_wait_seconds",
+            "How long the oldest inference request of a batch waited.",
+            _STAGE_BUCKETS,
+            "network",
         )
-        # What never happened so far is 0, not absent: a rate over an absent series is no rate.
+        # Start every label at 0: a rate over a missing series has no value.
         for reason in get_args(DropReason):
             self._dropped.labels(reason)
         for result in get_args(ResumeResult):
             self._resumed.labels(result)
 
     def frame_received(self) -> None:
-        """A frame came. `frame_processed`, `frame_dropped` or `frame_failed` tells what became of it."""
+        """Counts a received frame. `frame_processed`, `frame_dropped` or `frame_failed` follows for each."""
         self._received.inc()
 
     def frame_dropped(self, reason: DropReason) -> None:
-        """A frame that came will have no lanes."""
+        """Counts a received frame that gets no lanes."""
         self._dropped.labels(reason).inc()
 
     def frame_failed(self, error: BaseException) -> None:
-        """A frame that came will have no lanes because of `error`."""
+        """Counts a received frame that gets no lanes because of `error`."""
         code = error.code if isinstance(error, LanestreamError) else LanestreamError.code
         self.frame_dropped(_DROP_REASONS.get(code, "error"))
 
     def frame_processed(self, timing_ms: Mapping[str, float], age_s: float) -> None:
-        """A frame was answered: milliseconds of its stages, and seconds from its arrival to its reply."""
+        """Counts an answered frame: milliseconds of its stages, and seconds from its arrival to its reply."""
         self._processed.inc()
         self._age.observe(age_s)
-        for stage, spent in timing_ms.items():
+        for stage, duration_ms in timing_ms.items():
             if stage != _TOTAL:
-                self._stages.labels(stage).observe(1e-3 * spent)
+                self._stages.labels(stage).observe(1e-3 * duration_ms)
 
     def batch(self, report: BatchReport) -> None:
-        """A network ran."""
+        """Counts a batch that a network has run."""
         self._batch_size.labels(report.network).observe(report.rows)
         self._batch_wait.labels(report.network).observe(report.oldest_s)
         self._queue.set(report.still_waiting)
 
     def session_opened(self) -> None:
-        """One more stream has a session."""
+        """Counts a stream that opened or resumed a session."""
         self._sessions.inc()
 
     def session_closed(self) -> None:
-        """One stream less has a session."""
+        """Counts a stream whose session was closed."""
         self._sessions.dec()
 
     def tasks(self, count: int) -> None:
-        """How many tasks the event loop has just now."""
+        """Sets the number of tasks of the event loop."""
         self._tasks.set(count)
 
     def session_resumed(self, result: ResumeResult) -> None:
-        """A client came with a resume token."""
+        """Counts a `start` with a resume token."""
         self._resumed.labels(result).inc()
 
     def socket_closed(self, code: int) -> None:
-        """A WebSocket was closed with this code, by either side."""
+        """Counts a WebSocket closed with `code` by either side."""
         self._closes.labels(str(code)).inc()
 
     def refused(self, code: str) -> None:
-        """A client was told an error of this code."""
+        """Counts an error sent to a client."""
         self._refusals.labels(code).inc()
 
     def loaded(self, offer: Offer) -> None:
-        """A detector is ready, with a network."""
+        """Reports a detector that is ready, and its network."""
         network = offer.network
         device = "gpu" if network.provider in _ON_GPU else "cpu"
-        told = network.metadata
-        self._provider.labels(network.name, network.provider, device, told.get("precision", "unknown")).set(1)
+        metadata = network.metadata
+        self._provider.labels(network.name, network.provider, device, metadata.get("precision", "unknown")).set(1)
         self._fallback.labels(network.name).set(network.fell_back)
-        self._model.labels(told.get("name", network.name), told.get("version", "unknown"), network.sha256).set(1)
+        self._model.labels(metadata.get("name", network.name), metadata.get("version", "unknown"), network.sha256).set(
+            1
+        )
 
     def workers(self, pids: Callable[[], Sequence[int]]) -> None:
-        """There may be worker processes; `pids` tells their numbers."""
+        """Reports the worker processes; `pids` returns their process ids."""
         self._registry.register(WorkerCollector(pids))
 
     def exposition(self) -> bytes:
-        """All of it in Prometheus' text format, of the type `MEDIA_TYPE`."""
+        """Returns all metrics in Prometheus' text format, media type `MEDIA_TYPE`."""
         return generate_latest(self._registry)
 
-    def _counter(self, name: str, meaning: str, *labels: str) -> Counter:
-        return Counter(name, meaning, labels, registry=self._registry)
+    def _counter(self, name: str, description: str, *labels: str) -> Counter:
+        return Counter(name, description, labels, registry=self._registry)
 
-    def _gauge(self, name: str, meaning: str, *labels: str) -> Gauge:
-        return Gauge(name, meaning, labels, registry=self._registry)
+    def _gauge(self, name: str, description: str, *labels: str) -> Gauge:
+        return Gauge(name, description, labels, registry=self._registry)
 
-    def _histogram(self, name: str, meaning: str, buckets: tuple[float, ...], *labels: str) -> Histogram:
-        return Histogram(name, meaning, labels, buckets=buckets, registry=self._registry)
+    def _histogram(self, name: str, description: str, buckets: tuple[float, ...], *labels: str) -> Histogram:
+        return Histogram(name, description, labels, buckets=buckets, registry=self._registry)
+
+
+_MEMORY: Final = "process_resident_memory_bytes"
+_CPU_TIME: Final = "process_cpu_seconds_total"
+
+
+class WorkerCollector(Collector):
+    """The number of worker processes and the resources they use in total; `pids` returns their process ids."""
+
+    def __init__(self, pids: Callable[[], Sequence[int]]) -> None:
+        self._pids = pids
+
+    def collect(self) -> Iterable[Metric]:
+        """Returns the current metrics."""
+        pids = self._pids()
+        used: dict[str, float] = defaultdict(float)
+        for pid in pids:
+            for metric in ProcessCollector(pid=partial(int, pid), registry=None).collect():
+                for sample in metric.samples:
+                    used[sample.name] += sample.value
+        yield GaugeMetricFamily("lane_workers", "Worker processes that accept frames.", len(pids))
+        yield GaugeMetricFamily(
+            "lane_workers_resident_memory_bytes", "Resident memory of all worker processes.", used[_MEMORY]
+        )
+        yield CounterMetricFamily("lane_workers_cpu_seconds", "CPU time of all worker processes.", used[_CPU_TIME])

@@ -1,46 +1,80 @@
-"""How a refused request is answered: the status and the JSON body of an error."""
+"""Error responses: the HTTP status and JSON body of a refused request or handshake."""
 
 from __future__ import annotations
 
 from http import HTTPStatus
 from typing import TYPE_CHECKING
 
+from fastapi import Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
+from starlette.exceptions import HTTPException
 
-from lanestream.errors import answer_to
+from lanestream.errors import LanestreamError, ProtocolError, one_line, wire_status
 from lanestream.protocol import error_message
 
 if TYPE_CHECKING:
-    from fastapi import WebSocket
+    from fastapi import FastAPI, WebSocket
 
 
 class Problem(BaseModel):
-    """What every refused request is answered with."""
+    """The body of every error response."""
 
     code: str
     message: str
     hint: str
 
 
-def problem_of(error: BaseException) -> JSONResponse:
-    """The answer that tells `error`."""
-    told = error_message(error)
-    return problem_response(answer_to(error).http_status, Problem(code=told.code, message=told.message, hint=told.hint))
+def install_error_handlers(app: FastAPI) -> None:
+    """Makes `app` answer every error with a Problem and count it."""
+    app.add_exception_handler(LanestreamError, _handle_error)
+    app.add_exception_handler(RequestValidationError, _handle_invalid_request)
+    app.add_exception_handler(HTTPException, _handle_http_error)
+    app.add_exception_handler(Exception, _handle_error)
 
 
-def problem_response(status: int, problem: Problem) -> JSONResponse:
-    """The answer with this status and body, and the headers that belong to the status."""
+async def deny_handshake(socket: WebSocket, error: LanestreamError) -> None:
+    """Answers a WebSocket handshake with an error response, so that the socket is never opened."""
+    socket.app.state.service.metrics.refused(error.code)
+    await socket.send_denial_response(_error_response(error))
+
+
+async def _handle_error(request: Request, error: Exception) -> JSONResponse:
+    request.app.state.service.metrics.refused(error_message(error).code)
+    return _error_response(error)
+
+
+async def _handle_invalid_request(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)  # noqa: S101 - the class this handler is registered for
+    problem = error.errors()[0]
+    location = ".".join(str(part) for part in problem["loc"])
+    return await _handle_error(request, ProtocolError(f"{location}: {problem['msg']}", "see /docs"))
+
+
+async def _handle_http_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)  # noqa: S101 - the class this handler is registered for
+    code = HTTPStatus(error.status_code).name.lower()
+    request.app.state.service.metrics.refused(code)
+    # The path as it was sent: a Host header can change the path that `request.url` returns.
+    message = one_line(f"{request.method} {one_line(request.scope['path'], 80)}: {error.detail}")
+    response = _response(error.status_code, Problem(code=code, message=message, hint="see /docs"))
+    response.headers.update(error.headers or {})
+    return response
+
+
+def _error_response(error: Exception) -> JSONResponse:
+    shown = error_message(error)
+    problem = Problem(code=shown.code, message=shown.message, hint=shown.hint)
+    return _response(wire_status(error).http_status, problem)
+
+
+def _response(status: int, problem: Problem) -> JSONResponse:
+    """Returns the response with this status and body, and the headers that the status requires."""
     headers = {}
     if status in (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.REQUEST_TIMEOUT):
-        # What is left of a body that is too large or too slow will not be read.
+        # The rest of a body that is too large or too slow is never read.
         headers["connection"] = "close"
     if status == HTTPStatus.UNAUTHORIZED:
         headers["www-authenticate"] = "Bearer"
     return JSONResponse(problem.model_dump(), status, headers)
-
-
-async def deny(socket: WebSocket, error: BaseException) -> None:
-    """Answers a WebSocket's handshake with `error` as any request would be, so that it is never opened."""
-    socket.app.state.service.metrics.refused(error_message(error).code)
-    await socket.send_denial_response(problem_of(error))

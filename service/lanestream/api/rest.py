@@ -1,16 +1,16 @@
-"""Single requests: lanes of one image, what the service is, and whether it can be used."""
+"""Single requests: the lanes of one image, the loaded models, readiness, metrics and json_schemas."""
 
 from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel
 
-from lanestream.api.content_negotiation import preferred
 from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
 from lanestream.api.service import Service
@@ -18,21 +18,28 @@ from lanestream.asyncapi import document
 from lanestream.errors import NotAcceptableError, one_line
 from lanestream.images.decoding import decode
 from lanestream.messages import lanes_message
-from lanestream.protocol import CameraHeight, CameraModel, DetectorName, FieldOfView, LanesMessage, camera_of, schemas
-from lanestream.streaming.caller import Caller
+from lanestream.protocol import (
+    CameraHeight,
+    CameraModel,
+    DetectorName,
+    FieldOfView,
+    LanesMessage,
+    json_schemas,
+    parse_camera,
+)
+from lanestream.streaming.session_registry import Caller
 from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
-    from lanestream.api.service import Draw
     from lanestream.messages import ProcessedFrame
     from lanestream.streaming.session_registry import OpenSession
     from lanestream.workers.capabilities import Offer
 
-# For everybody: whether the service lives, and what its own repository tells as well.
-open_router = APIRouter()
-# For those whom the authenticator lets in.
+# Open to everyone: health checks, and documents that are public anyway.
+public_router = APIRouter()
+# Behind the authenticator.
 router = APIRouter()
-# For those whom the setting `metrics_access` names.
+# For the callers that the setting `metrics_access` allows.
 metrics_router = APIRouter()
 
 _JSON: Final = "application/json"
@@ -42,38 +49,33 @@ _FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["sch
 
 
 class NetworkEntry(BaseModel):
-    """A loaded network: its name and version, the detector that it answers, and what runs it."""
+    """A loaded network: its name and version, the detector that uses it, and the provider that runs it."""
 
     name: str
     detector: str
     provider: str
 
     @classmethod
-    def of(cls, offer: Offer, **more: Any) -> Self:
-        """The entry of an offer's network, with the fields `more`."""
-        return cls(name=offer.network.name, detector=offer.detector, provider=offer.network.provider, **more)
+    def from_info(cls, info: Offer, **fields: Any) -> Self:
+        """Returns the entry of a detector's network, with these further fields."""
+        return cls(name=info.network.name, detector=info.detector, provider=info.network.provider, **fields)
 
 
 class ModelEntry(NetworkEntry):
-    """A loaded network, the SHA-256 of its file, and what that says of itself."""
+    """A loaded network with the SHA-256 of its file and the file's metadata."""
 
     sha256: str
     metadata: dict[str, Any]
 
-    @classmethod
-    def about(cls, offer: Offer) -> Self:
-        """The entry of an offer's network."""
-        return cls.of(offer, sha256=offer.network.sha256, metadata=dict(offer.network.metadata))
-
 
 class ModelList(BaseModel):
-    """The networks of the service; the first is the default."""
+    """The loaded networks. The first one belongs to the default detector."""
 
     models: list[ModelEntry]
 
 
 class Readiness(BaseModel):
-    """That the service can be used, and with what; `provider` runs the default detector's network, the first one."""
+    """The loaded networks of a service that is ready. `provider` runs the default detector's network, the first one."""
 
     status: Literal["ready"]
     provider: str
@@ -81,32 +83,32 @@ class Readiness(BaseModel):
 
 
 _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
-    406: {"model": Problem, "description": "No answer in the form that was asked for"},
-    408: {"model": Problem, "description": "A body that took too long to come"},
-    413: {"model": Problem, "description": "More bytes or pixels than are accepted"},
-    415: {"model": Problem, "description": "Not an image, or a corrupt one"},
-    422: {"model": Problem, "description": "A malformed request, or a detector that is not loaded"},
-    503: {"model": Problem, "description": "Not ready yet, or at the session limit"},
+    406: {"model": Problem, "description": "No accepted media type is available"},
+    408: {"model": Problem, "description": "The body took too long to arrive"},
+    413: {"model": Problem, "description": "The image has too many bytes or pixels"},
+    415: {"model": Problem, "description": "The body is not an image, or a corrupt one"},
+    422: {"model": Problem, "description": "The request is malformed, or the detector is not loaded"},
+    503: {"model": Problem, "description": "The service is not ready, or at its session limit"},
 }
-REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
-    401: {"model": Problem, "description": "No API key, or a wrong one"},
-    403: {"model": Problem, "description": "A web page of an origin that may not"},
+AUTH_PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
+    401: {"model": Problem, "description": "The API key is missing or unknown"},
+    403: {"model": Problem, "description": "The origin of the web page is not allowed"},
 }
 
 
-async def admitted(request: Request) -> Caller:
-    """Who asks. Raises UnauthorizedError or ForbiddenError where they may not."""
-    return _service(request).authenticator.admit(request)
+async def authenticated(request: Request) -> Caller:
+    """Returns the caller. Raises UnauthorizedError or ForbiddenError."""
+    return _service(request).authenticator.authenticate(request)
 
 
 def _camera(
     camera_height: Annotated[
-        CameraHeight | None, Query(description="Metres up to the camera; lanes in metres.")
+        CameraHeight | None, Query(description="Height of the camera in meters; adds coordinates in meters.")
     ] = None,
-    field_of_view: Annotated[FieldOfView | None, Query(description="Its horizontal field of view in degrees.")] = None,
+    field_of_view: Annotated[FieldOfView | None, Query(description="Horizontal field of view in degrees.")] = None,
 ) -> CameraModel | None:
-    """The camera of a request. Raises ProtocolError for half of one."""
-    return camera_of(camera_height, field_of_view)
+    """Returns the camera of a request. Raises ProtocolError if only one parameter is given."""
+    return parse_camera(camera_height, field_of_view)
 
 
 @router.post(
@@ -127,79 +129,126 @@ def _camera(
 )
 async def detect(
     request: Request,
-    caller: Annotated[Caller, Depends(admitted)],
+    caller: Annotated[Caller, Depends(authenticated)],
     camera: Annotated[CameraModel | None, Depends(_camera)],
     horizon: Annotated[
-        float | None, Query(gt=0.0, lt=1.0, description="Row of the horizon as a share of the image height.")
+        float | None, Query(gt=0.0, lt=1.0, description="Row of the horizon as a fraction of the image height.")
     ] = None,
     detector: Annotated[
-        DetectorName | None, Query(description="What finds the lanes; the service's default where absent.")
+        DetectorName | None, Query(description="The detector that finds the lanes; the service's default if missing.")
     ] = None,
 ) -> Response:
-    """The lanes of one image, sent as the body or as the file of a form; as JSON, or drawn on it by `Accept`."""
+    """Returns the lanes of one image, sent as the body or as a form file: as JSON, or drawn on it, by `Accept`."""
     service = _service(request)
-    service.check_open()
-    runner = service.runner
-    form = _answer_form(request, service.draw)
-    # What is refused anyway is refused before its body is read; what is read slowly holds no session meanwhile.
-    runner.offers.chosen(detector)
+    service.check_ready()
+    pool = service.pool
+    media_type = _response_media_type(request, service)
+    # Requests that fail anyway are refused before their body is read, and a slow body does not occupy a session.
+    pool.offers.chosen(detector)
     service.sessions.check_limits(caller)
-    data = await service.bodies.image_file(request)
-    with service.sessions.opened(runner, caller, horizon, detector) as opened:
-        frame = await _processed(service, opened, EncodedFrame(data, 0.0, time.monotonic()))
+    data = await service.bodies.read_image(request)
+    with service.sessions.temporary(pool, caller, horizon, detector) as session:
+        frame = await _process(service, session, EncodedFrame(data, 0.0, time.monotonic()))
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
-    if form == _JSON:
+    if media_type == _JSON:
         return Response(message.model_dump_json(), media_type=_JSON)
-    picture = await runner.work(_picture, service, data, message, form)
-    return Response(picture, media_type=form)
+    picture = await pool.work(_draw_picture, service, data, message, media_type)
+    return Response(picture, media_type=media_type)
 
 
 @router.get("/v1/models", responses={503: _PROBLEMS[503]})
 async def models(request: Request) -> ModelList:
-    """The networks that are loaded, the default detector's first, and what really runs them."""
-    return ModelList(models=[ModelEntry.about(offer) for offer in _service(request).runner.offers.all])
+    """Returns the loaded networks and the providers that run them, the default detector's first."""
+    entries = [
+        ModelEntry.from_info(info, sha256=info.network.sha256, metadata=dict(info.network.metadata))
+        for info in _service(request).pool.offers.all
+    ]
+    return ModelList(models=entries)
 
 
-@open_router.get("/v1/schema")
+@public_router.get("/v1/schema")
 async def schema() -> dict[str, dict[str, Any]]:
-    """JSON Schemas of the messages of `/v1/stream`: what a client sends, and what the service sends."""
-    return schemas()
+    """Returns the JSON Schemas of the messages of `/v1/stream`, by the side that sends them."""
+    return json_schemas()
 
 
-@open_router.get("/v1/asyncapi.json")
+@public_router.get("/v1/asyncapi.json")
 async def asyncapi() -> dict[str, Any]:
-    """The contract of `/v1/stream` as an AsyncAPI 3.0 document, with the same schemas."""
+    """Returns the contract of `/v1/stream` as an AsyncAPI 3.0 document."""
     return document()
 
 
-@open_router.get("/healthz")
+@public_router.get("/healthz")
 async def healthz() -> dict[str, str]:
-    """Answers while the process lives."""
+    """Responds while the process is alive."""
     return {"status": "alive"}
 
 
-@open_router.get("/readyz", responses={503: _PROBLEMS[503]})
+@public_router.get("/readyz", responses={503: _PROBLEMS[503]})
 async def readyz(request: Request) -> Readiness:
-    """Answers once the networks are loaded and warm, until the service is about to stop."""
-    _service(request).check_open()
-    networks = [NetworkEntry.of(offer) for offer in _service(request).runner.offers.all]
+    """Responds with 200 once the networks are loaded and warm, until the service is about to stop."""
+    _service(request).check_ready()
+    networks = [NetworkEntry.from_info(info) for info in _service(request).pool.offers.all]
     return Readiness(status="ready", provider=networks[0].provider, networks=networks)
 
 
 @metrics_router.get("/metrics", response_class=Response, responses={200: {"content": {MEDIA_TYPE: {}}}})
 async def exposition(request: Request) -> Response:
-    """Counters and histograms in Prometheus' text format."""
+    """Returns the metrics in Prometheus' text format."""
     metrics = _service(request).metrics
     metrics.tasks(len(asyncio.all_tasks()))
     return Response(metrics.exposition(), headers={"content-type": MEDIA_TYPE})
 
 
-async def _processed(service: Service, opened: OpenSession, image: EncodedFrame) -> ProcessedFrame:
-    """The lanes of an image, counted whether they are found or not."""
+def preferred_media_type(accept: str, available: Sequence[str]) -> str | None:
+    """Returns the available media type with the highest weight in an Accept header, the first of equals.
+
+    None if the header accepts none of them (RFC 9110, section 12.5.1).
+    """
+    weights = dict(_parse_media_range(part) for part in accept.split(",") if part.strip())
+
+    def weight(media_type: str) -> float:
+        """Returns the weight of the most specific range that matches."""
+        for media_range in (media_type, f"{media_type.partition('/')[0]}/*", "*/*"):
+            if media_range in weights:
+                return weights[media_range]
+        return 0.0
+
+    best = max(available, key=weight)
+    return best if weight(best) > 0.0 else None
+
+
+def _parse_media_range(part: str) -> tuple[str, float]:
+    """Returns a media range and its weight; 1 without a `q` parameter, 0 for a malformed one."""
+    media_range, *parameters = (piece.strip().lower() for piece in part.split(";"))
+    for parameter in parameters:
+        name, _, value = parameter.partition("=")
+        if name.strip() == "q":
+            try:
+                return media_range, float(value)
+            except ValueError:
+                return media_range, 0.0
+    return media_range, 1.0
+
+
+def _response_media_type(request: Request, service: Service) -> str:
+    """Returns the media type of the response. Raises NotAcceptableError if the client accepts none."""
+    available = [_JSON, *_PICTURES] if service.draw is not None else [_JSON]
+    media_type = preferred_media_type(request.headers.get("accept", "*/*"), available)
+    if media_type is None:
+        accept = one_line(request.headers["accept"], 80)
+        raise NotAcceptableError(
+            f"no response is available as {accept!r}", f"available media types: {', '.join(available)}"
+        )
+    return media_type
+
+
+async def _process(service: Service, session: OpenSession, image: EncodedFrame) -> ProcessedFrame:
+    """Returns the lanes of an image. Counts the frame, processed or failed."""
     service.metrics.frame_received()
     try:
-        async with service.runner.turn():
-            frame = await service.runner.run(opened.camera, image)
+        async with service.pool.turn():
+            frame = await service.pool.run(session.camera, image)
     except BaseException as error:
         service.metrics.frame_failed(error)
         raise
@@ -207,23 +256,13 @@ async def _processed(service: Service, opened: OpenSession, image: EncodedFrame)
     return frame
 
 
+def _draw_picture(service: Service, data: bytes, message: LanesMessage, media_type: str) -> bytes:
+    assert service.draw is not None  # noqa: S101 - pictures are available only with it
+    image = decode(data, service.settings.image_limits)
+    _, encoded = cv2.imencode(_PICTURES[media_type], service.draw(image, message))
+    return encoded.tobytes()
+
+
 def _service(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
-
-
-def _answer_form(request: Request, draw: Draw | None) -> str:
-    offered = [_JSON, *_PICTURES] if draw is not None else [_JSON]
-    form = preferred(request.headers.get("accept", "*/*"), offered)
-    if form is None:
-        raise NotAcceptableError(
-            f"no answer as {one_line(request.headers['accept'], 80)!r}", f"{', '.join(offered)} can be had"
-        )
-    return form
-
-
-def _picture(service: Service, data: bytes, message: LanesMessage, form: str) -> bytes:
-    assert service.draw is not None  # noqa: S101 - else there would be no such form
-    image = decode(data, service.settings.image_limits)
-    _, encoded = cv2.imencode(_PICTURES[form], service.draw(image, message))
-    return encoded.tobytes()

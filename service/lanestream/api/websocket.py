@@ -1,7 +1,7 @@
-"""The WebSocket of a stream: one task always reads, one answers frame after frame, one watches the clock and the door.
+"""The WebSocket of a stream: one task reads, one answers frames, one watches time limits, draining and eviction.
 
-The rules are in `stream_rules`. The reader never waits for a frame's work, because pongs are only seen while something
-reads, and because a frame that waits in the kernel can't be replaced by a newer one.
+The rules are in `StreamProtocol`. The reader never waits for a frame to be processed: pongs are only handled while a
+task reads, and a frame that waits in the kernel can't be replaced by a newer one.
 """
 
 from __future__ import annotations
@@ -13,312 +13,308 @@ from typing import TYPE_CHECKING, Final
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
-from lanestream.api.problems import deny
+from lanestream.api.problems import deny_handshake
 from lanestream.errors import (
     EvictedError,
     ExpiredError,
     LanestreamError,
     NoDetectorError,
     ProtocolError,
-    answer_to,
+    wire_status,
 )
 from lanestream.messages import lanes_message
 from lanestream.protocol import (
     SUBPROTOCOL,
-    DrainingMessage,
-    EndMessage,
     ErrorMessage,
-    FrameMessage,
-    Message,
     ReadyMessage,
+    ServerMessage,
     StartMessage,
     error_message,
     parse_client_message,
 )
-from lanestream.streaming.stream_protocol import Outcome, StreamProtocol, check_age
+from lanestream.streaming.stream_protocol import FrameOutcome, StreamProtocol, StreamState
 from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
     from lanestream.api.service import Service
     from lanestream.messages import ProcessedFrame
-    from lanestream.streaming.caller import Caller
-    from lanestream.streaming.session_registry import OpenSession
+    from lanestream.streaming.session_registry import Caller, OpenSession
     from lanestream.streaming.stream_protocol import IncomingFrame
     from lanestream.workers.capabilities import Offer
 
 router = APIRouter()
 
 _log = logging.getLogger(__name__)
-_MOST_REASON_BYTES: Final = 123  # of a close frame, by RFC 6455
-_NORMAL: Final = 1000
-_RESTART: Final = 1012
-_SHORTEST_WATCH_S: Final = 0.01
+_MAX_REASON_BYTES: Final = 123  # of a close frame, by RFC 6455
+_NORMAL_CLOSURE: Final = 1000
+_SERVICE_RESTART: Final = 1012
+_MIN_WATCH_S: Final = 0.01
 
 
 @router.websocket("/v1/stream")
 async def stream(socket: WebSocket) -> None:
-    """One stream of frames, from the handshake to the close."""
+    """Serves one stream, from the handshake to the close."""
     service: Service = socket.app.state.service
     try:
-        caller = service.authenticator.admit(socket)
-        service.check_open()
+        caller = service.authenticator.authenticate(socket)
+        service.check_ready()
     except LanestreamError as error:
-        await deny(socket, error)
+        await deny_handshake(socket, error)
         return
-    offered = socket.scope.get("subprotocols", [])
-    await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
-    await StreamHandler(socket, service, caller).run()
+    subprotocols = socket.scope.get("subprotocols", [])
+    await socket.accept(SUBPROTOCOL if SUBPROTOCOL in subprotocols else None)
+    await StreamConnection(socket, service, caller).run()
 
 
-class StreamHandler:
-    """Joins one socket, one session and the rules of their stream."""
+class StreamConnection:
+    """Connects one WebSocket with the protocol of its stream and its session."""
 
     def __init__(self, socket: WebSocket, service: Service, caller: Caller) -> None:
         self._socket = socket
         self._service = service
         self._caller = caller
-        self._rules = StreamProtocol(service.settings.stream_limits, time.monotonic())
-        self._opened: OpenSession | None = None
+        self._protocol = StreamProtocol(service.settings.stream_limits, time.monotonic())
+        self._session: OpenSession | None = None
         self._work: asyncio.Task[ProcessedFrame] | None = None
-        self._news = asyncio.Event()
-        self._alarm = asyncio.Event()
+        self._received = asyncio.Event()
+        self._wake_watcher = asyncio.Event()
         self._evicted = False
-        self._closed = False
+        self._close_counted = False
 
     def wake(self) -> None:
-        """Has the stream look at the clock, and whether the service is about to stop."""
-        self._alarm.set()
+        """Makes the watcher check the time limits, and whether the service is draining."""
+        self._wake_watcher.set()
 
     async def run(self) -> None:
         """Serves the stream until either side ends it."""
         self._service.streams.add(self)
         try:
-            await self._converse()
-        except WebSocketDisconnect as gone:
-            self._count_close(gone.code)
+            await self._run_tasks()
+        except WebSocketDisconnect as disconnect:
+            self._count_close(disconnect.code)
         except Exception as error:
             if not isinstance(error, LanestreamError):
-                _log.exception("stream failed", extra=self._named())
+                _log.exception("stream failed", extra=self._log_fields())
             await self._end_with(error)
         finally:
-            await self._release()
+            await self._release_session()
             self._service.streams.discard(self)
 
-    async def _converse(self) -> None:
-        """Reads, answers and watches at once; the end of one is the end of all."""
+    async def _run_tasks(self) -> None:
+        """Reads, answers and watches concurrently until one of the three tasks ends."""
         try:
-            async with asyncio.TaskGroup() as tasks:
-                all_of_them = [tasks.create_task(step()) for step in (self._read, self._answer, self._watch)]
-                for task in all_of_them:
-                    task.add_done_callback(lambda _: [other.cancel() for other in all_of_them])
-        except ExceptionGroup as group:
-            raise group.exceptions[0] from None
+            async with asyncio.TaskGroup() as group:
+                tasks = [group.create_task(run()) for run in (self._read, self._answer, self._watch)]
+                for task in tasks:
+                    task.add_done_callback(lambda _: [other.cancel() for other in tasks])
+        except ExceptionGroup as errors:
+            raise errors.exceptions[0] from None
 
     async def _read(self) -> None:
-        """Takes messages in as they come, until the client is gone or breaks a rule that ends the stream."""
+        """Receives messages until the client disconnects or an error ends the stream."""
         while (message := await self._socket.receive())["type"] != "websocket.disconnect":
             try:
-                await self._take_in(message.get("text"), message.get("bytes"))
+                await self._receive(message.get("text"), message.get("bytes"))
             except (ProtocolError, NoDetectorError) as error:
-                await self._tell(error)
-            self._news.set()
+                await self._send(error_message(error))
+            self._received.set()
         self._count_close(message["code"])
 
-    async def _take_in(self, text: str | None, data: bytes | None) -> None:
+    async def _receive(self, text: str | None, data: bytes | None) -> None:
         now = time.monotonic()
         if text is None:
-            self._receive(data or b"", now)
+            self._receive_image(data or b"", now)
             return
         message = parse_client_message(text)
         if isinstance(message, StartMessage):
-            # First of all, because a detector that is not there leaves the stream as it was.
-            offer = self._service.runner.offers.chosen(message.detector)
-            self._service.check_open()
-            self._rules.start(message, now)
-            await self._start(message, offer)
-        elif isinstance(message, FrameMessage):
-            self._rules.announce(message, now)
-        elif isinstance(message, EndMessage):
-            self._rules.end(now)
+            # The only message that needs I/O: it opens or resumes a session.
+            await self._start(message, now)
+        else:
+            self._protocol.receive_message(message, now)
+        await self._send_pending()
 
-    def _receive(self, data: bytes, now: float) -> None:
+    def _receive_image(self, data: bytes, now: float) -> None:
         metrics = self._service.metrics
         metrics.frame_received()
         try:
-            superseded = self._rules.receive(data, now)
+            replaced = self._protocol.receive_image(data, now)
         except LanestreamError as error:
             metrics.frame_failed(error)
             raise
-        for _ in range(superseded):
+        for _ in range(replaced):
             metrics.frame_dropped("superseded")
-        if not self._rules.over:
+        if self._protocol.state is not StreamState.DRAINED:
             self._ensure_session()
 
-    async def _start(self, message: StartMessage, offer: Offer) -> None:
-        opened = await self._service.sessions.start(self._service.runner, self._caller, message)
-        self._attach(opened)
-        if opened.resumption is not None:
-            self._service.metrics.session_resumed(opened.resumption)
-        if opened.resumption == "resumed":
-            self._rules.go_on(opened.last_seq, opened.stream_s, time.monotonic())
-        await self._send(self._ready(opened, offer))
+    async def _start(self, message: StartMessage, now: float) -> None:
+        # Checked first, so that asking for a detector that is not loaded leaves the stream unchanged.
+        detector = self._service.pool.offers.chosen(message.detector)
+        self._service.check_ready()
+        self._protocol.receive_start(message, now)
+        session = await self._service.sessions.start(self._service.pool, self._caller, message)
+        self._attach(session)
+        if session.resume_outcome is not None:
+            self._service.metrics.session_resumed(session.resume_outcome)
+        if session.resumed:
+            self._protocol.resume(session.last_seq, session.stream_s, time.monotonic())
+        await self._send(self._ready(session, detector))
 
-    def _ensure_session(self) -> OpenSession:
-        """The stream's session; a first frame opens one that can't be resumed, because nobody was told its token."""
-        if self._opened is None:
-            self._attach(self._service.sessions.open(self._service.runner, self._caller))
-        assert self._opened is not None  # noqa: S101 - attached just now
-        return self._opened
-
-    def _attach(self, opened: OpenSession) -> None:
-        self._opened = opened
-        opened.on_evict = self._evict
-        # An open stream has other limits of time.
-        self.wake()
-        self._service.metrics.session_opened()
-        options = self._rules.options
-        detector = self._service.runner.offers.chosen(options.detector).detector
-        how = "resumed" if opened.resumption == "resumed" else "opened"
-        told = (how, self._caller.identity, options.mode, detector)
-        _log.info("stream %s by %s, mode %s, detector %s", *told, extra=self._named())
-
-    def _ready(self, opened: OpenSession, offer: Offer) -> ReadyMessage:
+    def _ready(self, session: OpenSession, detector: Offer) -> ReadyMessage:
         return ReadyMessage(
-            session=opened.id,
-            resume_token=opened.token or "",
-            resumed=opened.resumption == "resumed",
-            last_seq=opened.last_seq,
-            mode=self._rules.mode,
-            detector=offer.detector,
-            model=offer.network.name,
-            provider=offer.network.provider,
+            session=session.id,
+            resume_token=session.token or "",
+            resumed=session.resumed,
+            last_seq=session.last_seq,
+            mode=self._protocol.mode,
+            detector=detector.detector,
+            model=detector.network.name,
+            provider=detector.network.provider,
             limits=self._service.limits,
         )
 
+    def _ensure_session(self) -> OpenSession:
+        """Returns the stream's session. Without `start`, opens one that can't be resumed: the client has no token."""
+        if self._session is None:
+            self._attach(self._service.sessions.open(self._service.pool, self._caller))
+        assert self._session is not None  # noqa: S101 - attached above
+        return self._session
+
+    def _attach(self, session: OpenSession) -> None:
+        self._session = session
+        session.on_evict = self._evict
+        # The time limits of an open stream differ from those of the handshake.
+        self.wake()
+        self._service.metrics.session_opened()
+        _log.info(
+            "stream %s by %s, mode %s, detector %s",
+            "resumed" if session.resumed else "opened",
+            self._caller.identity,
+            self._protocol.mode,
+            self._service.pool.offers.chosen(self._protocol.options.detector).detector,
+            extra=self._log_fields(),
+        )
+
     async def _answer(self) -> None:
-        """Answers frames one at a time and in order, until the stream is finished; then says so and closes."""
-        while not self._rules.finished:
-            if self._rules.has_waiting:
-                await self._send(await self._next_answer())
+        """Answers frames in order, one at a time, until the stream is finished; then closes the socket."""
+        while not self._protocol.finished:
+            if self._protocol.has_waiting_frame:
+                await self._send(await self._answer_next())
                 continue
-            self._news.clear()
-            await self._news.wait()
-        for late in self._rules.rest():
-            if late.refusal is not None:
-                await self._send(self._problem(late.refusal, late.seq))
-        # Whoever has seen the summary finds the place free.
-        await self._release()
-        if self._rules.ended:
-            await self._send(self._rules.summary(time.monotonic()))
-            await self._close(_NORMAL)
+            self._received.clear()
+            await self._received.wait()
+        self._protocol.finish()
+        await self._send_pending()
+        # A client that has received the summary may open its next session right away.
+        await self._release_session()
+        if self._protocol.ended_by_client:
+            await self._send(self._protocol.summary(time.monotonic()))
+            await self._close(_NORMAL_CLOSURE)
         else:
-            await self._close(_RESTART, "the service is about to stop")
+            await self._close(_SERVICE_RESTART, "the service is about to stop")
 
-    async def _next_answer(self) -> Message:
-        """The answer to the next frame. Which one that is shows when its turn has come: until then newer ones count."""
-        self._rules.queue(True)
-        async with self._service.runner.turn(fresh=self._rules.mode == "latest"):
-            self._rules.queue(False)
-            frame = self._rules.take()
-            assert frame is not None  # noqa: S101 - of waiting frames one always stays
-            return await self._answer_to(frame)
+    async def _answer_next(self) -> ServerMessage:
+        """Waits for a slot in the worker pool and answers the frame that is next then."""
+        self._protocol.request_slot()
+        async with self._service.pool.turn(fresh=self._protocol.mode == "latest"):
+            frame = self._protocol.take_frame()
+            assert frame is not None  # noqa: S101 - a waiting frame is replaced, never removed
+            return await self._answer_frame(frame)
 
-    async def _answer_to(self, frame: IncomingFrame) -> Message:
-        opened = self._ensure_session()
+    async def _answer_frame(self, frame: IncomingFrame) -> ServerMessage:
+        session = self._ensure_session()
         try:
             if frame.refusal is not None:
                 raise frame.refusal
-            self._work = asyncio.create_task(self._process(opened, frame))
-            # The work goes on where the stream ends meanwhile: half of it would leave the session between two frames.
+            self._work = asyncio.create_task(self._process(session, frame))
+            # A frame is processed to its end even if the stream ends, so that the session's state stays consistent.
             processed = await asyncio.shield(self._work)
         except Exception as error:
             if not isinstance(error, LanestreamError):
-                _log.exception("frame failed", extra=self._named(frame.seq))
+                _log.exception("frame failed", extra=self._log_fields(frame.seq))
             self._service.metrics.frame_failed(error)
-            self._settle(Outcome.EXPIRED if isinstance(error, ExpiredError) else Outcome.FAILED)
-            return self._problem(error, frame.seq)
-        self._settle(Outcome.ANSWERED)
+            self._complete(session, FrameOutcome.EXPIRED if isinstance(error, ExpiredError) else FrameOutcome.FAILED)
+            return error_message(error, seq=frame.seq)
+        self._complete(session, FrameOutcome.ANSWERED)
         timing = processed.result.timing_ms
         self._service.metrics.frame_processed(timing, 1e-3 * timing["total"])
         return lanes_message(
             processed,
             seq=frame.seq,
             timestamp=frame.timestamp,
-            dropped=self._rules.dropped,
-            camera=self._rules.options.camera,
+            dropped=self._protocol.dropped,
+            camera=self._protocol.options.camera,
         )
 
-    async def _process(self, opened: OpenSession, frame: IncomingFrame) -> ProcessedFrame:
-        opened.working = True
+    async def _process(self, session: OpenSession, frame: IncomingFrame) -> ProcessedFrame:
+        session.processing = True
         try:
             encoded = EncodedFrame(frame.data, frame.timestamp, frame.arrived, frame.deadline)
-            processed = await self._service.runner.run(opened.camera, encoded)
-            opened.last_seq, opened.stream_s = frame.seq, self._rules.stream_s(time.monotonic())
+            processed = await self._service.pool.run(session.camera, encoded)
+            session.last_seq, session.stream_s = frame.seq, self._protocol.stream_s(time.monotonic())
             return processed
         finally:
-            opened.working = False
+            session.processing = False
 
-    def _settle(self, outcome: Outcome) -> None:
-        self._rules.settle(outcome, time.monotonic())
-        if self._opened is not None:
-            self._service.sessions.note(self._opened)
+    def _complete(self, session: OpenSession, outcome: FrameOutcome) -> None:
+        self._protocol.complete_frame(outcome, time.monotonic())
+        self._service.sessions.schedule_save(session)
 
     async def _watch(self) -> None:
-        """Ends the stream that is silent or too old, or whose session is wanted elsewhere; tells of draining once."""
+        """Raises the error that ends an idle, too old or evicted stream. Announces a drain of the service."""
         while not self._service.draining:
             try:
-                async with asyncio.timeout(max(self._seconds_left(), _SHORTEST_WATCH_S)):
-                    await self._alarm.wait()
+                async with asyncio.timeout(max(self._seconds_to_next_limit(), _MIN_WATCH_S)):
+                    await self._wake_watcher.wait()
             except TimeoutError:
-                self._rules.check_silence(time.monotonic())
-                if self._opened is not None:
-                    check_age(self._service.sessions.age_s(self._opened), self._service.settings.session_s)
-            self._alarm.clear()
+                self._protocol.check_idle(time.monotonic())
+                if self._session is not None:
+                    self._service.sessions.check_age(self._session)
+            self._wake_watcher.clear()
             if self._evicted:
-                raise EvictedError("the session goes on over another socket", "a resume token is for one at a time")
-        self._rules.drain()
-        token = None if self._opened is None else self._opened.token
-        await self._send(DrainingMessage(resume_token=token, deadline_s=self._service.settings.drain_s))
-        self._news.set()
+                raise EvictedError(
+                    "the session was resumed over another socket", "use a resume token on one socket at a time"
+                )
+        token = None if self._session is None else self._session.token
+        self._protocol.drain(token, self._service.settings.drain_s)
+        await self._send_pending()
+        self._received.set()
         await asyncio.Event().wait()
 
-    def _seconds_left(self) -> float:
-        silence = self._rules.silence_left(time.monotonic())
-        if self._opened is None:
-            return silence
-        return min(silence, self._service.settings.session_s - self._service.sessions.age_s(self._opened))
+    def _seconds_to_next_limit(self) -> float:
+        idle_s_left = self._protocol.idle_s_left(time.monotonic())
+        if self._session is None:
+            return idle_s_left
+        return min(idle_s_left, self._service.sessions.life_s_left(self._session))
 
     def _evict(self) -> None:
         self._evicted = True
-        self._alarm.set()
+        self._wake_watcher.set()
 
-    async def _release(self) -> None:
-        """Lets go of the session, after the frame in work."""
-        opened, self._opened = self._opened, None
-        if opened is None:
+    async def _release_session(self) -> None:
+        """Closes the session once the frame in progress is done."""
+        session, self._session = self._session, None
+        if session is None:
             return
         if self._work is not None:
             await asyncio.wait([self._work])
-        await self._service.sessions.close(opened, for_good=self._rules.ended)
+        await self._service.sessions.close(session, resumable=not self._protocol.ended_by_client)
         self._service.metrics.session_closed()
-        count = self._rules.summary(time.monotonic())
+        count = self._protocol.summary(time.monotonic())
         for _ in range(count.frames - count.answered - count.failed - count.dropped):
             self._service.metrics.frame_dropped("disconnected")
         _log.info(
             "stream closed after %.1f s: %d frames, %d answered, %d failed, %d dropped",
             *(count.duration_s, count.frames, count.answered, count.failed, count.dropped),
-            extra={"session": opened.id},
+            extra={"session": session.id},
         )
 
-    async def _tell(self, error: LanestreamError) -> None:
-        await self._send(self._problem(error))
+    async def _send_pending(self) -> None:
+        for message in self._protocol.messages_to_send():
+            await self._send(message)
 
-    def _problem(self, error: Exception, seq: int | None = None, *, fatal: bool = False) -> ErrorMessage:
-        told = error_message(error, seq=seq, fatal=fatal)
-        self._service.metrics.refused(told.code)
-        return told
-
-    async def _send(self, message: Message) -> None:
+    async def _send(self, message: ServerMessage) -> None:
+        if isinstance(message, ErrorMessage):
+            self._service.metrics.refused(message.code)
         await self._socket.send_text(message.model_dump_json())
 
     async def _close(self, code: int, reason: str = "") -> None:
@@ -326,22 +322,22 @@ class StreamHandler:
         await self._socket.close(code, reason)
 
     def _count_close(self, code: int) -> None:
-        """The side that closes first gives the code; what the other one answers is no second close."""
-        if not self._closed:
-            self._closed = True
+        """Counts the code of the side that closes first; the other side's reply is not a second close."""
+        if not self._close_counted:
+            self._close_counted = True
             self._service.metrics.socket_closed(code)
 
     async def _end_with(self, error: Exception) -> None:
-        """Tells what ended the stream. Whoever sees its socket closed finds its session ready to be resumed."""
-        told = self._problem(error, fatal=True)
-        reason = told.message.encode()[:_MOST_REASON_BYTES].decode(errors="ignore")
+        """Sends the error that ends the stream, and closes the socket once the session is ready to be resumed."""
+        message = error_message(error, fatal=True)
+        reason = message.message.encode()[:_MAX_REASON_BYTES].decode(errors="ignore")
         try:
-            await self._send(told)
-            await self._release()
-            await self._close(answer_to(error).close_code, reason)
+            await self._send(message)
+            await self._release_session()
+            await self._close(wire_status(error).close_code, reason)
         except (WebSocketDisconnect, RuntimeError):
-            _log.debug("the client was gone before it could be told: %s", told.message)
+            _log.debug("the client disconnected before this error was sent: %s", message.message)
 
-    def _named(self, seq: int | None = None) -> dict[str, str | int | None]:
-        """What log lines tell of the stream beside their message."""
-        return {"session": None if self._opened is None else self._opened.id, "seq": seq}
+    def _log_fields(self, seq: int | None = None) -> dict[str, str | int | None]:
+        """Returns the fields that log records of this stream carry besides their message."""
+        return {"session": None if self._session is None else self._session.id, "seq": seq}

@@ -1,1 +1,1 @@
-"""Streams and their sessions, without sockets: protocol, registry, stores."""
+"""Streams and their sessions without sockets: the stream protocol, the session registry and the session stores."""

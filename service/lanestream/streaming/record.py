@@ -1,4 +1,4 @@
-"""What is kept of a session between two sockets, as bytes of JSON."""
+"""The saved form of a session, as JSON bytes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from lanestream.session import SessionState
 
 
 class SessionRecord(BaseModel):
-    """A session at rest: its name, when it began and was saved (wall clock), its state.
+    """A saved session: its name, the wall-clock times at which it was created and saved, and its state.
 
-    `stream_s` is the time on its stream's own clock and `last_seq` its last frame when it was saved. `clean` tells that
-    it was saved after its last frame; without that, frames may have come that this record knows nothing of.
+    `stream_s` is the stream's own clock and `last_seq` its last answered frame, both at the time of saving. `clean`
+    means that the session was saved after its last frame; otherwise, later frames may have been answered that the
+    record does not include.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -25,12 +26,12 @@ class SessionRecord(BaseModel):
     state: SessionState
 
     def to_bytes(self) -> bytes:
-        """The record as it is kept."""
+        """Returns the record as JSON."""
         return self.model_dump_json().encode()
 
     @classmethod
-    def of_bytes(cls, data: bytes) -> SessionRecord | None:
-        """The record in `data`; None where another version of the product wrote it in a way that is not understood."""
+    def from_bytes(cls, data: bytes) -> SessionRecord | None:
+        """Returns the record in `data`; None if an incompatible version of the service wrote it."""
         try:
             return cls.model_validate_json(data)
         except ValidationError:

@@ -1,7 +1,9 @@
-"""Where sessions are kept beyond their sockets: in this process, or in Redis for all replicas.
+"""Where sessions are kept after their socket closes: in this process, or in Redis for all replicas.
 
-A record has one owner at a time. Whoever takes it becomes the owner, and whoever lost it can't write it any more: a
-replica that still holds an evicted socket does no harm, however late it notices.
+A stored session has one owner at a time. Taking it over makes the caller its owner, and the previous owner can't write
+it any more: a replica that has not noticed yet that its socket was evicted can do no harm.
+
+To add a store, implement `SessionStore` in a module of its own and select it in `open_store`.
 """
 
 from __future__ import annotations
@@ -12,13 +14,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
-# Records of a few kilobytes each; the oldest give way.
-_MOST_RECORDS: Final = 4096
+# Sessions take a few kilobytes each. Beyond this number the oldest ones are deleted.
+_MAX_SESSIONS: Final = 4096
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A session's record, whose session it is (the caller's identity), and who may write it."""
+class StoredSession:
+    """A session's record, the identity of the caller it belongs to, and the owner who may write it."""
 
     caller: str
     owner: str
@@ -26,65 +28,75 @@ class Entry:
 
 
 class SessionStore(Protocol):
-    """Keeps entries for a while. Raises StoreError where it can't be reached."""
+    """Keeps sessions for a limited time. Every method raises StoreError if the store can't be reached."""
 
-    async def take(self, key: str, caller: str, owner: str) -> bytes | None:
-        """The data of an entry that belongs to `caller`, now owned by `owner`; None where there is none of theirs."""
+    async def take_over(self, key: str, caller: str, owner: str) -> bytes | None:
+        """Makes `owner` the owner of the session and returns its data; None if `caller` has no session of this key."""
         ...
 
-    async def save(self, key: str, entry: Entry, ttl_s: float) -> bool:
-        """Keeps `entry` for `ttl_s` seconds; False, and nothing is changed, where another owner took it."""
+    async def save(self, key: str, session: StoredSession, ttl_s: float) -> bool:
+        """Keeps `session` for `ttl_s` seconds. Returns False and changes nothing if someone else owns it now."""
         ...
 
-    async def forget(self, key: str, owner: str) -> None:
-        """Removes the entry, where `owner` still owns it."""
+    async def delete(self, key: str, owner: str) -> None:
+        """Deletes the session if `owner` still owns it."""
         ...
 
     async def close(self) -> None:
-        """Lets go of connections."""
+        """Closes connections."""
         ...
+
+
+def open_store(redis_url: str | None) -> SessionStore:
+    """Returns the store at a URL; None keeps sessions in this process. Raises SettingsError for an invalid URL."""
+    if redis_url is None:
+        return MemoryStore()
+    # The redis package is an optional extra, needed by replicated services only.
+    from lanestream.streaming.redis_store import RedisStore
+
+    return RedisStore(redis_url)
 
 
 class MemoryStore:
-    """Entries of this process alone. `clock` tells monotonic seconds."""
+    """Keeps sessions in this process. `clock` returns monotonic seconds."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic, most: int = _MOST_RECORDS) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic, max_sessions: int = _MAX_SESSIONS) -> None:
         self._clock = clock
-        self._most = most
-        self._entries: OrderedDict[str, tuple[Entry, float]] = OrderedDict()
+        self._max_sessions = max_sessions
+        self._sessions: OrderedDict[str, tuple[StoredSession, float]] = OrderedDict()
 
-    async def take(self, key: str, caller: str, owner: str) -> bytes | None:
+    async def take_over(self, key: str, caller: str, owner: str) -> bytes | None:
         """See SessionStore."""
-        entry = self._alive(key)
-        if entry is None or entry.caller != caller:
+        session = self._get(key)
+        if session is None or session.caller != caller:
             return None
-        self._entries[key] = replace(entry, owner=owner), self._entries[key][1]
-        return entry.data
+        self._sessions[key] = replace(session, owner=owner), self._sessions[key][1]
+        return session.data
 
-    async def save(self, key: str, entry: Entry, ttl_s: float) -> bool:
+    async def save(self, key: str, session: StoredSession, ttl_s: float) -> bool:
         """See SessionStore."""
-        kept = self._alive(key)
-        if kept is not None and kept.owner != entry.owner:
+        saved = self._get(key)
+        if saved is not None and saved.owner != session.owner:
             return False
-        self._entries[key] = entry, self._clock() + ttl_s
-        self._entries.move_to_end(key)
-        while len(self._entries) > self._most:
-            self._entries.popitem(last=False)
+        self._sessions[key] = session, self._clock() + ttl_s
+        self._sessions.move_to_end(key)
+        while len(self._sessions) > self._max_sessions:
+            self._sessions.popitem(last=False)
         return True
 
-    async def forget(self, key: str, owner: str) -> None:
+    async def delete(self, key: str, owner: str) -> None:
         """See SessionStore."""
-        kept = self._alive(key)
-        if kept is not None and kept.owner == owner:
-            del self._entries[key]
+        saved = self._get(key)
+        if saved is not None and saved.owner == owner:
+            del self._sessions[key]
 
     async def close(self) -> None:
-        """Forgets everything."""
-        self._entries.clear()
+        """Deletes all sessions."""
+        self._sessions.clear()
 
-    def _alive(self, key: str) -> Entry | None:
-        entry, expires = self._entries.get(key, (None, 0.0))
-        if entry is not None and expires <= self._clock():
-            del self._entries[key]
+    def _get(self, key: str) -> StoredSession | None:
+        session, expires = self._sessions.get(key, (None, 0.0))
+        if session is not None and expires <= self._clock():
+            del self._sessions[key]
             return None
-        return entry
+        return session

@@ -1,7 +1,7 @@
-"""The rules of one stream, without its socket: who may say what when, which frame is next, and the final count.
+"""The rules of one stream without its socket (sans-I/O): what is allowed when, which frame is next, the counts.
 
-Nothing here waits, reads a clock or knows of asyncio, so that every rule can be tested as a plain call. `now` is always
-the time on one monotonic clock, in seconds.
+Nothing here waits, reads a clock or imports asyncio, so every rule can be tested with plain calls. `now` is always a
+time on one monotonic clock, in seconds.
 """
 
 from __future__ import annotations
@@ -10,25 +10,26 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from lanestream.errors import (
-    DrainingError,
-    IdleError,
-    LanestreamError,
-    OverrunError,
-    ProtocolError,
-    RateError,
-    TooOldError,
+from lanestream.errors import DrainingError, IdleError, LanestreamError, OverrunError, ProtocolError, RateError
+from lanestream.protocol import (
+    DrainingMessage,
+    EndMessage,
+    FrameMessage,
+    Mode,
+    ServerMessage,
+    StartMessage,
+    SummaryMessage,
+    error_message,
 )
-from lanestream.protocol import FrameMessage, Mode, StartMessage, SummaryMessage
 
 
 @dataclass(frozen=True)
 class StreamLimits:
-    """What a stream may do.
+    """The limits of one stream.
 
-    In mode `all` up to `credits` frames may be unanswered at a time. `frames_per_s` and `bytes_per_s` hold on average
-    over `burst_s` seconds. In mode `latest` a frame expires after `frame_deadline_s`. The first message comes within
-    `handshake_s`, and nothing is ever longer away than `idle_s`.
+    In mode `all`, up to `credits` frames may be unanswered at a time. `frames_per_s` and `bytes_per_s` are averages
+    over `burst_s` seconds. In mode `latest`, a frame expires `frame_deadline_s` seconds after its arrival. The first
+    message must arrive within `handshake_s` seconds, every later one within `idle_s` seconds of the previous activity.
     """
 
     credits: int = 8
@@ -42,9 +43,10 @@ class StreamLimits:
 
 @dataclass(frozen=True)
 class IncomingFrame:
-    """A frame as it came: its number, its capture time in seconds, the image file, when it came (monotonic seconds).
+    """A received frame: its number, capture time in seconds, image file and arrival time (monotonic seconds).
 
-    After `deadline` its lanes are of no use. One with a `refusal` is answered with that, and its image is forgotten.
+    After `deadline` its lanes are no longer useful. A frame with a `refusal` is answered with that error, and its image
+    is discarded.
     """
 
     seq: int
@@ -55,8 +57,29 @@ class IncomingFrame:
     refusal: LanestreamError | None = None
 
 
-class Outcome(Enum):
-    """What became of a frame whose turn had come."""
+class StreamState(Enum):
+    """The life of a stream.
+
+    `start` or a first image opens it. The client's `end` moves every state to ENDING, a stop of the service moves
+    CONNECTING and OPEN to DRAINING. `StreamProtocol.finish` turns ENDING into ENDED, and DRAINING into DRAINED.
+    """
+
+    CONNECTING = auto()
+    """The socket is open, and neither `start` nor an image has arrived."""
+    OPEN = auto()
+    """Frames are accepted."""
+    ENDING = auto()
+    """The client sent `end`. The frames held are still answered; any further message is an error."""
+    ENDED = auto()
+    """Every frame was answered after `end`."""
+    DRAINING = auto()
+    """The service is about to stop. The frames held are still answered; further ones are refused."""
+    DRAINED = auto()
+    """Every frame that arrived before the drain was answered. Images that still arrive are ignored."""
+
+
+class FrameOutcome(Enum):
+    """The result of processing a frame."""
 
     ANSWERED = auto()
     FAILED = auto()
@@ -64,220 +87,240 @@ class Outcome(Enum):
 
 
 class TokenBucket:
-    """A token bucket: `rate` units a second on average, and what `burst_s` seconds bring at once."""
+    """Limits a rate: `rate` units per second on average, with bursts of `burst_s` seconds' worth."""
 
     def __init__(self, rate: float, burst_s: float, now: float) -> None:
         self._rate = rate
-        self._most = max(rate * burst_s, 1.0)
-        self._left = self._most
-        self._at = now
+        self._capacity = max(rate * burst_s, 1.0)
+        self._tokens = self._capacity
+        self._updated_at = now
 
     def covers(self, amount: float, now: float) -> bool:
-        """Whether `amount` is left. One that is larger than any burst waits for a full bucket."""
-        self._left = min(self._most, self._left + self._rate * (now - self._at))
-        self._at = now
-        return self._left >= min(amount, self._most)
+        """Returns whether `amount` is available. An amount above the capacity needs a full bucket."""
+        self._tokens = min(self._capacity, self._tokens + self._rate * (now - self._updated_at))
+        self._updated_at = now
+        return self._tokens >= min(amount, self._capacity)
 
     def spend(self, amount: float) -> None:
-        """Takes `amount` out, if need be beyond the bottom."""
-        self._left -= amount
+        """Removes `amount`; the level may become negative."""
+        self._tokens -= amount
 
 
 class StreamProtocol:
-    """One stream from its opening to its end.
+    """The server side of one stream, from its first message to its last.
 
-    In mode `latest` one frame waits at most, and a newer one takes its place. In mode `all` none is dropped, and one
-    more than is granted is an error. Every frame that comes is answered, refused or counted as dropped.
+    In mode `latest` at most one frame waits, and a newer one replaces it. In mode `all` no frame is dropped, and a
+    frame beyond the credits is an error. Every frame is answered, refused or counted as dropped.
     """
 
     def __init__(self, limits: StreamLimits, now: float) -> None:
         self._limits = limits
-        self._accepted_at = now
-        self._clock_zero = now
-        self._heard_at: float | None = None
-        self._options: StartMessage | None = None
+        self._state = StreamState.CONNECTING
+        self._options = StartMessage()
+        self._connected_at = now
+        self._stream_began_at = now
+        self._last_activity: float | None = None
         self._announced: FrameMessage | None = None
         self._waiting: deque[IncomingFrame] = deque()
-        self._busy = False
-        self._queued = False
-        self._ended = False
-        self._draining = False
-        self._over = False
+        self._current: IncomingFrame | None = None
+        self._slot_requested = False
+        self._outgoing: list[ServerMessage] = []
         self._next_seq = 0
         self._received = self._answered = self._failed = self._dropped = 0
-        self._frames = TokenBucket(limits.frames_per_s, limits.burst_s, now)
-        self._bytes = TokenBucket(limits.bytes_per_s, limits.burst_s, now)
+        self._frame_budget = TokenBucket(limits.frames_per_s, limits.burst_s, now)
+        self._byte_budget = TokenBucket(limits.bytes_per_s, limits.burst_s, now)
+
+    @property
+    def state(self) -> StreamState:
+        """The current state."""
+        return self._state
 
     @property
     def options(self) -> StartMessage:
-        """What the client opened the stream with, or the defaults."""
-        return self._options or StartMessage()
+        """The `start` message of the client, or its defaults."""
+        return self._options
 
     @property
     def mode(self) -> Mode:
-        """What happens to frames that come faster than they are answered."""
-        return self.options.mode
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the stream was opened, by a `start` or by a first frame."""
-        return self._options is not None
+        """What happens to frames that arrive faster than they are answered."""
+        return self._options.mode
 
     @property
     def dropped(self) -> int:
-        """Frames that got no lanes because newer ones came, or because they had waited too long."""
+        """Frames without an answer, because a newer one replaced them or because they expired."""
         return self._dropped
 
     @property
-    def has_waiting(self) -> bool:
-        """Whether a frame waits for its turn."""
-        return bool(self._waiting) and not self._busy
+    def has_waiting_frame(self) -> bool:
+        """Whether `take_frame` would return a frame."""
+        return bool(self._waiting) and self._current is None
 
     @property
-    def ended(self) -> bool:
-        """Whether the client has said that no more frames come."""
-        return self._ended
-
-    @property
-    def over(self) -> bool:
-        """Whether the last answers are given, so that what comes is too late."""
-        return self._over
+    def ended_by_client(self) -> bool:
+        """Whether the client sent `end`."""
+        return self._state in (StreamState.ENDING, StreamState.ENDED)
 
     @property
     def finished(self) -> bool:
-        """Whether the stream is at its end, by the client's `end` or by draining, and every frame was answered."""
-        if self._busy:
+        """Whether the client or the service ended the stream, and every accepted frame was answered."""
+        if self._current is not None:
             return False
-        if self._draining and not self._ended:
+        if self._state is StreamState.DRAINING:
             return all(frame.refusal is not None for frame in self._waiting)
-        return self._ended and not self._waiting
+        if self._state is StreamState.ENDING:
+            return not self._waiting
+        return self._state in (StreamState.ENDED, StreamState.DRAINED)
 
-    def start(self, message: StartMessage, now: float) -> None:
-        """The client opens the stream. Raises ProtocolError where it is open already."""
-        self._hear("start", now)
-        if self.is_open:
-            raise ProtocolError("the stream is open already", "`start` comes once, before the first frame")
+    def receive_start(self, message: StartMessage, now: float) -> None:
+        """Opens the stream. Raises ProtocolError unless it is the first message besides `frame`."""
+        self._note_activity("`start`", now)
+        if self._state is not StreamState.CONNECTING:
+            raise ProtocolError(
+                f"`start` came in a stream that is already {self._state.name.lower()}",
+                "send `start` once, before the first image",
+            )
         self._options = message
+        self._state = StreamState.OPEN
 
-    def go_on(self, last_seq: int | None, stream_s: float, now: float) -> None:
-        """The stream goes on where another socket's ended: after `last_seq`, `stream_s` seconds on its clock."""
+    def resume(self, last_seq: int | None, stream_s: float, now: float) -> None:
+        """Continues a resumed session: numbers after `last_seq`, and the stream's clock at `stream_s` seconds."""
         self._next_seq = 0 if last_seq is None else last_seq + 1
-        self._clock_zero = now - stream_s
+        self._stream_began_at = now - stream_s
 
-    def stream_s(self, now: float) -> float:
-        """The stream's own clock, which tells the time of frames that have none."""
-        return now - self._clock_zero
+    def receive_message(self, message: FrameMessage | EndMessage, now: float) -> None:
+        """Handles every text message except `start`; replies go to `messages_to_send`.
 
-    def announce(self, message: FrameMessage, now: float) -> None:
-        """The client numbers the binary message that follows; of two announcements in a row the later one counts."""
-        self._hear("frame", now)
-        self._announced = message
-
-    def receive(self, data: bytes, now: float) -> int:
-        """A frame comes, and opens the stream where nothing did before; how many waiting ones it took the place of.
-
-        After `rest` it is not taken. Raises OverrunError in mode `all` where no credit was left for it, and
-        ProtocolError after `end`.
+        Raises ProtocolError after `end`. Of two `frame` messages in a row the later one applies.
         """
-        self._hear("an image", now)
-        self._options = self.options
-        if self._over:
+        self._note_activity(f"`{message.type}`", now)
+        match message:
+            case FrameMessage():
+                self._announced = message
+            case EndMessage():
+                self._state = StreamState.ENDING
+
+    def receive_image(self, data: bytes, now: float) -> int:
+        """Accepts or refuses a frame and returns how many waiting frames it replaced. A first image opens the stream.
+
+        Raises OverrunError in mode `all` if no credit is left, and ProtocolError after `end`.
+        """
+        self._note_activity("an image", now)
+        if self._state is StreamState.DRAINED:
             return 0
-        unanswered = len(self._waiting) + self._busy
+        if self._state is StreamState.CONNECTING:
+            self._state = StreamState.OPEN
+        unanswered = len(self._waiting) + (self._current is not None)
         if self.mode == "all" and unanswered >= self._limits.credits:
             raise OverrunError(
-                f"{unanswered} frames are unanswered and one more came",
-                f"mode `all` grants {self._limits.credits} of them; wait for answers, or use mode `latest`",
+                f"another frame came while {unanswered} frames were unanswered",
+                f"mode `all` allows {self._limits.credits} unanswered frames; wait for answers, or use mode `latest`",
             )
         refusal = self._refusal(len(data), now)
-        dropped = self._drop_waiting(refusal is not None) if self.mode == "latest" else 0
+        replaced = self._replace_waiting(refused=refusal is not None) if self.mode == "latest" else 0
         self._waiting.append(self._numbered(data, now, refusal))
         self._received += 1
-        return dropped
+        return replaced
 
-    def end(self, now: float) -> None:
-        """The client has no more frames."""
-        self._hear("end", now)
-        self._ended = True
+    def messages_to_send(self) -> list[ServerMessage]:
+        """Returns the messages that are due to the client, each of them once."""
+        messages, self._outgoing = self._outgoing, []
+        return messages
 
-    def drain(self) -> None:
-        """The service is about to stop: what has come is answered, what comes from now on is refused."""
-        self._draining = True
+    def drain(self, resume_token: str | None, deadline_s: float) -> None:
+        """Announces that the service is about to stop: the frames held are answered, later ones are refused."""
+        if self._state in (StreamState.CONNECTING, StreamState.OPEN):
+            self._state = StreamState.DRAINING
+        self._outgoing.append(DrainingMessage(resume_token=resume_token, deadline_s=deadline_s))
 
-    def queue(self, waits: bool) -> None:
-        """Tells whether the frame whose turn it is waits for frames of others; a newer one may then replace it."""
-        self._queued = waits
+    def request_slot(self) -> None:
+        """Notes that the next frame waits for other streams; until `take_frame` a newer frame may replace it."""
+        self._slot_requested = True
 
-    def take(self) -> IncomingFrame | None:
-        """The frame whose turn it is; None while another is being worked on, or where none waits."""
-        if self._busy or not self._waiting:
+    def take_frame(self) -> IncomingFrame | None:
+        """Returns the next frame; None if another one is being processed, or if none waits."""
+        self._slot_requested = False
+        if not self.has_waiting_frame:
             return None
-        self._busy = True
-        return self._waiting.popleft()
+        self._current = self._waiting.popleft()
+        return self._current
 
-    def rest(self) -> list[IncomingFrame]:
-        """What waits when the stream is finished: refused frames, whose answers are due. What comes now is too late."""
-        rest, self._waiting = list(self._waiting), deque()
-        self._failed += len(rest)
-        self._over = True
-        return rest
+    def complete_frame(self, outcome: FrameOutcome, now: float) -> None:
+        """Counts the frame that was taken. Call it before sending the reply, which renews the client's credit."""
+        self._current = None
+        self._last_activity = now
+        self._answered += outcome is FrameOutcome.ANSWERED
+        self._failed += outcome is FrameOutcome.FAILED
+        self._dropped += outcome is FrameOutcome.EXPIRED
 
-    def settle(self, outcome: Outcome, now: float) -> None:
-        """The frame that was taken has come to its `outcome`. Comes before the reply, which renews the credit."""
-        self._busy = False
-        self._heard_at = now
-        self._answered += outcome is Outcome.ANSWERED
-        self._failed += outcome is Outcome.FAILED
-        self._dropped += outcome is Outcome.EXPIRED
+    def finish(self) -> None:
+        """Ends a stream that is `finished`. Refused frames that still wait are answered through `messages_to_send`."""
+        if not self.finished:
+            raise RuntimeError(f"finish() expects a finished stream; this one is {self._state.name.lower()}")
+        late, self._waiting = self._waiting, deque()
+        self._failed += len(late)
+        self._outgoing += [error_message(frame.refusal, seq=frame.seq) for frame in late if frame.refusal is not None]
+        self._state = StreamState.ENDED if self.ended_by_client else StreamState.DRAINED
 
-    def silence_left(self, now: float) -> float:
-        """Seconds until the stream has been silent for too long; work in progress is no silence."""
-        if self._heard_at is None:
-            return self._accepted_at + self._limits.handshake_s - now
-        if self._busy or self._waiting:
+    def stream_s(self, now: float) -> float:
+        """Returns the seconds since the stream began, which are the timestamps of frames without one."""
+        return now - self._stream_began_at
+
+    def idle_s_left(self, now: float) -> float:
+        """Returns the seconds until the stream has been idle for too long. A frame in progress is activity."""
+        if self._last_activity is None:
+            return self._connected_at + self._limits.handshake_s - now
+        if self._current is not None or self._waiting:
             return self._limits.idle_s
-        return self._heard_at + self._limits.idle_s - now
+        return self._last_activity + self._limits.idle_s - now
 
-    def check_silence(self, now: float) -> None:
-        """Raises IdleError where nothing came for too long."""
-        if self.silence_left(now) <= 0.0:
-            most = self._limits.handshake_s if self._heard_at is None else self._limits.idle_s
-            raise IdleError(f"nothing came for {most:g} seconds", "open the stream again when there are frames")
+    def check_idle(self, now: float) -> None:
+        """Raises IdleError if the stream has been idle for too long."""
+        if self.idle_s_left(now) <= 0.0:
+            limit = self._limits.handshake_s if self._last_activity is None else self._limits.idle_s
+            raise IdleError(f"no message came for {limit:g} seconds", "open the stream again when there are frames")
 
     def summary(self, now: float) -> SummaryMessage:
-        """The count of all frames so far."""
+        """Returns the counts of all frames so far."""
         return SummaryMessage(
             frames=self._received,
             answered=self._answered,
             failed=self._failed,
             dropped=self._dropped,
-            duration_s=round(now - self._accepted_at, 3),
+            duration_s=round(now - self._connected_at, 3),
         )
 
+    def _note_activity(self, received: str, now: float) -> None:
+        """Restarts the idle clock. Raises ProtocolError after `end`."""
+        self._last_activity = now
+        if self.ended_by_client:
+            raise ProtocolError(f"{received} came after `end`", "send nothing after `end`")
+
     def _refusal(self, size: int, now: float) -> LanestreamError | None:
-        """Why a frame of `size` bytes is not taken; None where it is."""
-        if self._draining:
+        """Returns why a frame of `size` bytes is refused; None if it is accepted, which spends its budget."""
+        if self._state is StreamState.DRAINING:
             return DrainingError("the service is about to stop", "resume the session on another replica")
         limits = self._limits
-        if not self._frames.covers(1.0, now):
-            return RateError(f"more than {limits.frames_per_s:g} frames a second came", "send fewer")
-        if not self._bytes.covers(size, now):
-            return RateError(f"more than {limits.bytes_per_s:,.0f} bytes a second came", "send smaller images")
-        self._frames.spend(1.0)
-        self._bytes.spend(size)
+        if not self._frame_budget.covers(1.0, now):
+            return RateError(f"more than {limits.frames_per_s:g} frames per second came", "send fewer frames")
+        if not self._byte_budget.covers(size, now):
+            return RateError(f"more than {limits.bytes_per_s:,.0f} bytes per second came", "send smaller images")
+        self._frame_budget.spend(1.0)
+        self._byte_budget.spend(size)
         return None
 
-    def _drop_waiting(self, refused: bool) -> int:
-        """Makes place for a newer frame. A frame whose turn has come stays, whether or not it was taken already.
+    def _replace_waiting(self, *, refused: bool) -> int:
+        """Drops the frames that a newer one replaces, and returns their number.
 
-        One that is `refused` takes no other's place than that of refused ones.
+        A `refused` frame replaces only refused ones. If no frame is in progress or waits for its slot, the first
+        waiting frame is about to be taken and stays.
         """
-        turn = 0 if self._busy or self._queued else 1
+        protected = 0 if self._current is not None or self._slot_requested else 1
         before = len(self._waiting)
-        while len(self._waiting) > turn and (not refused or self._waiting[-1].refusal is not None):
+        while len(self._waiting) > protected and (not refused or self._waiting[-1].refusal is not None):
             self._waiting.pop()
-        self._dropped += before - len(self._waiting)
-        return before - len(self._waiting)
+        replaced = before - len(self._waiting)
+        self._dropped += replaced
+        return replaced
 
     def _numbered(self, data: bytes, now: float, refusal: LanestreamError | None) -> IncomingFrame:
         announced = self._announced or FrameMessage()
@@ -287,14 +330,3 @@ class StreamProtocol:
         self._next_seq = seq + 1
         deadline = now + self._limits.frame_deadline_s if self.mode == "latest" else None
         return IncomingFrame(seq, timestamp, b"" if refusal else data, now, deadline, refusal)
-
-    def _hear(self, what: str, now: float) -> None:
-        self._heard_at = now
-        if self._ended:
-            raise ProtocolError(f"{what} came after `end`", "`end` is the last message of a stream")
-
-
-def check_age(age_s: float, most_s: float) -> None:
-    """Raises TooOldError where a session has lived longer than `most_s` seconds."""
-    if age_s >= most_s:
-        raise TooOldError(f"the session is {age_s:.0f} seconds old, which is the most", "open a new one")

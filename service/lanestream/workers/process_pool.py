@@ -212,11 +212,11 @@ class ProcessPool(WorkerPool):
         cls,
         setup: WorkerSetup,
         processes: int | None = None,
-        threads_of: Callable[[int], int] | None = None,
+        threads_per_process: Callable[[int], int] | None = None,
         observe: Callable[[BatchReport], None] | None = None,
         frame_s: float = _FRAME_S,
     ) -> ProcessPool:
-        """Returns a pool with warm workers: `threads_of` returns the threads of each of so many `processes`, default 1.
+        """Returns a pool with warm workers: `threads_per_process` returns the threads of each of so many `processes`, default 1.
 
         By default networks on the CPU get a process for each processor, up to 8 and to what a container's memory has room
         for; those on a device get one for all, in which the requests of all cameras meet. Raises what `setup.load`
@@ -232,7 +232,7 @@ class ProcessPool(WorkerPool):
             for worker in workers:
                 await worker.kill()
             raise error.exceptions[0] if isinstance(error, ExceptionGroup) else error from None
-        return cls(setup, workers, threads_of(processes) if threads_of is not None else 1, observe, frame_s)
+        return cls(setup, workers, threads_per_process(processes) if threads_per_process is not None else 1, observe, frame_s)
 
     @property
     def works(self) -> bool:

@@ -18,7 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from lanestream.api.metrics import DropReason, Metrics
 from lanestream.inference.batcher import BatchReport
-from lanestream.keys import find, read_keys
+from lanestream.keys import find_key, read_keys
 from lanestream.settings import Settings
 from lanestream.workers.capabilities import Capabilities
 
@@ -109,7 +109,7 @@ def test_secrets_are_created_once_and_are_valid_keys(tmp_path: Path) -> None:
     assert run_script() == first
     keys = read_keys(secrets / "api_keys")
     for name in ("local", "prometheus"):
-        key = find(keys, first[f"{name}_key"])
+        key = find_key(keys, first[f"{name}_key"])
         assert key is not None
         assert key.name == name
     assert len(first["grafana_password"]) == 24

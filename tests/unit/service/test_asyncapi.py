@@ -1,4 +1,4 @@
-"""The AsyncAPI document says what the models say, and docs/asyncapi.yaml says the same."""
+"""The AsyncAPI document agrees with the models, and docs/asyncapi.yaml with the document."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lanestream.protocol import (
     StartMessage,
     SummaryMessage,
     TimingModel,
-    schemas,
+    json_schemas,
 )
 
 ROOT = Path(__file__).parents[3]
@@ -73,62 +73,62 @@ MESSAGES: list[Message] = [
 
 
 def objects(value: Any) -> Iterator[dict[str, Any]]:
-    """Every object in a document, at any depth."""
+    """Yields every object in a document, at any depth."""
     if isinstance(value, dict):
         yield value
     for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         yield from objects(inner)
 
 
-def at(pointer: str) -> Any:
-    found: Any = document()
-    for name in pointer.removeprefix("#/").split("/"):
-        found = found[name]
-    return found
+def resolve(reference: str) -> Any:
+    value: Any = document()
+    for name in reference.removeprefix("#/").split("/"):
+        value = value[name]
+    return value
 
 
 def payload_validator(name: str) -> jsonschema_rs.Draft7Validator:
-    """What checks messages of a type, with all the document's schemas at hand."""
+    """Returns a validator for messages of a type, which can resolve all json_schemas of the document."""
     payload = document()["components"]["messages"][name]["payload"]
     return jsonschema_rs.Draft7Validator({**payload, "components": document()["components"]})
 
 
-def test_the_file_is_what_the_models_say() -> None:
+def test_the_file_is_up_to_date() -> None:
     spec = importlib.util.spec_from_file_location("asyncapi", ROOT / "tools" / "asyncapi.py")
     assert spec is not None
     assert spec.loader is not None
     tool = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tool)
-    assert FILE.read_text() == tool.written(), "make asyncapi"
+    assert FILE.read_text() == tool.to_yaml(), "make asyncapi"
     assert yaml.safe_load(FILE.read_text()) == document()
 
 
-def test_every_reference_leads_somewhere() -> None:
+def test_every_reference_can_be_resolved() -> None:
     references = [each["$ref"] for each in objects(document()) if "$ref" in each]
     assert len(references) > 30
     for reference in references:
-        assert isinstance(at(reference), dict)
+        assert isinstance(resolve(reference), dict)
 
 
-def test_every_message_of_the_protocol_is_told_and_no_other() -> None:
-    told = {each["name"] for each in document()["components"]["messages"].values()}
-    spoken = {
+def test_exactly_the_messages_of_the_protocol_are_documented() -> None:
+    documented = {message["name"] for message in document()["components"]["messages"].values()}
+    in_protocol = {
         name.removesuffix("Message").lower()
-        for side in schemas().values()
+        for side in json_schemas().values()
         for name in side["$defs"]
         if name.endswith("Message")
     }
-    assert told == spoken | {"image"}
+    assert documented == in_protocol | {"image"}
     in_use = {
         reference["$ref"].rpartition("/")[2]
         for operation in document()["operations"].values()
         for reference in [*operation["messages"], *operation.get("reply", {}).get("messages", [])]
     }
-    assert in_use == told
+    assert in_use == documented
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: message.type)
-def test_the_schemas_take_our_messages_and_refuse_others(message: Any) -> None:
+def test_the_schemas_accept_valid_messages_and_refuse_others(message: Any) -> None:
     validator = payload_validator(message.type)
     value = json.loads(message.model_dump_json())
     validator.validate(value)
@@ -136,16 +136,24 @@ def test_the_schemas_take_our_messages_and_refuse_others(message: Any) -> None:
     assert not validator.is_valid({**value, "type": "other"})
 
 
-def test_the_examples_are_messages() -> None:
+def test_the_examples_are_valid_messages() -> None:
     messages = document()["components"]["messages"]
-    examples = [(name, each["payload"]) for name, told in messages.items() for each in told.get("examples", ())]
+    examples = [
+        (name, example["payload"]) for name, message in messages.items() for example in message.get("examples", ())
+    ]
     assert len(examples) >= 6
     for name, payload in examples:
         payload_validator(name).validate(payload)
 
 
-def test_the_schemas_are_of_the_dialect_that_asyncapi_asks_for() -> None:
-    for schema in document()["components"]["schemas"].values():
+def test_the_json_schemas_name_all_messages() -> None:
+    assert {"start", "frame", "end"} == set(json_schemas()["client"]["discriminator"]["mapping"])
+    server = json_schemas()["server"]["discriminator"]["mapping"]
+    assert {"ready", "lanes", "error", "draining", "summary"} == set(server)
+
+
+def test_the_schemas_use_the_dialect_that_asyncapi_requires() -> None:
+    for schema in document()["components"]["json_schemas"].values():
         jsonschema_rs.meta.validate({**schema, "$schema": "http://json-schema.org/draft-07/schema#"})
     newer = {"prefixItems", "$defs", "dependentRequired", "unevaluatedProperties"}
     assert not [each for each in objects(document()) if newer & each.keys()]

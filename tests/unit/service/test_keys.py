@@ -1,4 +1,4 @@
-"""API keys: made, read, found."""
+"""API keys: creating, reading and finding them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from pathlib import Path
 import pytest
 
 from lanestream.errors import SettingsError
-from lanestream.keys import ApiKey, find, new_key, parse_keys, read_keys
+from lanestream.keys import ApiKey, find_key, new_key, parse_keys, read_keys
 
 
-def test_a_key_is_found_by_its_token_alone() -> None:
+def test_only_its_token_finds_a_key() -> None:
     tokens, keys = zip(*(new_key(f"camera-{number}") for number in range(3)), strict=True)
     assert len(set(tokens)) == 3
     for token, key in zip(tokens, keys, strict=True):
-        assert find(keys, token) == key
+        assert find_key(keys, token) == key
         assert key.digest == hashlib.sha256(token.encode()).hexdigest()
         assert token not in str(key)
     for wrong in ("", "x", tokens[0][:-1], tokens[0] + "x", keys[0].digest, "ÿ€"):
-        assert find(keys, wrong) is None
-    assert find((), tokens[0]) is None
+        assert find_key(keys, wrong) is None
+    assert find_key((), tokens[0]) is None
 
 
-def test_a_token_fits_into_a_header_and_into_a_subprotocol() -> None:
+def test_a_token_is_valid_in_a_header_and_in_a_subprotocol() -> None:
     token, _ = new_key("x")
     assert token.isascii()
     assert token.replace("-", "").replace("_", "").isalnum()
@@ -35,18 +35,18 @@ def test_a_hash_is_not_shown() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a:b", "ä", "x" * 65, "a\n"])
-def test_a_name_that_would_not_be_read_back_is_refused(name: str) -> None:
-    with pytest.raises(SettingsError, match="can't be the name of a key"):
+def test_an_invalid_name_is_refused(name: str) -> None:
+    with pytest.raises(SettingsError, match="is not a valid name for a key"):
         new_key(name)
 
 
-def test_what_is_printed_is_read_back(tmp_path: Path) -> None:
+def test_printed_keys_can_be_read(tmp_path: Path) -> None:
     one, other = (new_key(name)[1] for name in ("one", "other"))
     file = tmp_path / "keys"
     file.write_bytes(
         f"\ufeff# our keys\r\n{one}\r\n\r\n  # the old one\n  {str(other).replace('other:', 'one:')}  \n".encode()
     )
-    assert read_keys(file) == (one, ApiKey("one", other.digest)), "two keys of one name are one caller"
+    assert read_keys(file) == (one, ApiKey("one", other.digest)), "two keys with one name are one caller"
 
 
 DIGEST = "0123456789abcdef" * 4
@@ -56,26 +56,26 @@ DIGEST = "0123456789abcdef" * 4
     "bad",
     ["secret", f"secret:{DIGEST[1:]}", f"secret:{DIGEST}0", f":{DIGEST}", f"se cret:{DIGEST}", f"secret:x{DIGEST[1:]}"],
 )
-def test_what_is_no_key_is_told_by_its_line_and_not_shown(tmp_path: Path, bad: str) -> None:
+def test_an_invalid_key_is_reported_by_its_line_and_never_quoted(tmp_path: Path, bad: str) -> None:
     file = tmp_path / "keys"
     file.write_text(f"# keys\ngood:{DIGEST}\n{bad}\n")
-    with pytest.raises(SettingsError, match=r"keys: line 3 is no key; NAME:SHA256 is expected") as caught:
+    with pytest.raises(SettingsError, match=r"keys: line 3 is not a valid key; expected NAME:SHA256") as caught:
         read_keys(file)
     assert "secret" not in str(caught.value)
     assert DIGEST[1:9] not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
-    [(None, "no such file"), (b"", "no key in it"), (b"# none\n", "no key in it"), (b"\xff", "no text")],
+    ("data", "message"),
+    [(None, "no such file"), (b"", "no key found"), (b"# none\n", "no key found"), (b"\xff", "not a UTF-8 text file")],
 )
-def test_a_file_without_keys_opens_no_door(tmp_path: Path, data: bytes | None, said: str) -> None:
+def test_a_file_without_keys_is_refused(tmp_path: Path, data: bytes | None, message: str) -> None:
     file = tmp_path / "keys"
     if data is not None:
         file.write_bytes(data)
-    with pytest.raises(SettingsError, match=said):
+    with pytest.raises(SettingsError, match=message):
         read_keys(file)
 
 
-def test_upper_case_digits_are_the_same() -> None:
+def test_digests_may_be_in_upper_case() -> None:
     assert parse_keys([f"a:{DIGEST.upper()}"], "entry") == (ApiKey("a", DIGEST),)

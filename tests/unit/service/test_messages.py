@@ -1,4 +1,4 @@
-"""Results told as messages: exact to a hundredth of a pixel."""
+"""Results converted into messages: exact to a hundredth of a pixel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lanestream.protocol import LanesMessage, parse_server_message
 from lanestream.road.curve import Curve, curve_basis
 from lanestream.road.results import EgoLane, FrameResult, LaneBoundary, LaneChange
 
-STAGES = ("decode", "propose", "queue", "infer", "track", "total")
+STAGES = ("decode", "propose", "queue", "infer", "fit", "track", "total")
 
 
 def boundary(curve: Curve, top: float, bottom: float) -> LaneBoundary:
@@ -21,7 +21,8 @@ def boundary(curve: Curve, top: float, bottom: float) -> LaneBoundary:
     return LaneBoundary(5, -1, "predicted", 0.98765, curve, covariance, top, bottom, 1.23456)
 
 
-def told(result: FrameResult) -> LanesMessage:
+def as_message(result: FrameResult) -> LanesMessage:
+    """Returns the message for `result`, sent and parsed."""
     result = FrameResult(result.lanes, result.ego, result.horizon, result.events, dict.fromkeys(STAGES, 1.23456))
     frame = ProcessedFrame((3840, 2160), result)
     message = parse_server_message(lanes_message(frame, seq=3, timestamp=0.12, dropped=2).model_dump_json())
@@ -29,24 +30,24 @@ def told(result: FrameResult) -> LanesMessage:
     return message
 
 
-def test_all_fields_are_told() -> None:
+def test_all_fields_are_reported() -> None:
     lane = boundary(Curve(870.123456789, (1919.5, -1.25, 5000.0)), 1000.0, 2159.0)
-    message = told(FrameResult((lane,), EgoLane(5, None), 870.123456789, (LaneChange(5, "left"),)))
+    message = as_message(FrameResult((lane,), EgoLane(5, None), 870.123456789, (LaneChange(5, "left"),)))
     assert (message.seq, message.timestamp, message.width, message.height, message.dropped) == (3, 0.12, 3840, 2160, 2)
-    assert (message.horizon, message.timing_ms.total) == (870.12, 1.235)
+    assert (message.horizon, message.timing_ms.total, message.timing_ms.fit) == (870.12, 1.235, 1.235)
     assert message.ego.model_dump(exclude_none=True) == {"left": 5}
     assert message.events[0].model_dump() == {"type": "lane_change", "track_id": 5, "direction": "left"}
-    (lane_told,) = message.lanes
-    assert (lane_told.track_id, lane_told.position, lane_told.state) == (5, -1, "predicted")
-    assert (lane_told.probability, lane_told.age_s) == (0.9877, 1.235)
-    assert lane_told.covariance[2][2] == 666667.0
-    assert len(lane_told.points) == 24
-    assert lane_told.points[0] == lane_told.line.bottom
-    assert lane_told.points[-1] == lane_told.line.top
-    assert [y for _, y in lane_told.points] == sorted((y for _, y in lane_told.points), reverse=True)
+    (reported,) = message.lanes
+    assert (reported.track_id, reported.position, reported.state) == (5, -1, "predicted")
+    assert (reported.probability, reported.age_s) == (0.9877, 1.235)
+    assert reported.covariance[2][2] == 666667.0
+    assert len(reported.points) == 24
+    assert reported.points[0] == reported.line.bottom
+    assert reported.points[-1] == reported.line.top
+    assert [y for _, y in reported.points] == sorted((y for _, y in reported.points), reverse=True)
 
 
-def test_lanes_of_a_reduced_picture_are_told_in_pixels_of_its_file() -> None:
+def test_lanes_of_a_reduced_image_are_reported_in_pixels_of_its_file() -> None:
     lane = boundary(Curve(100.0, (300.0, -1.25, 500.0)), 120.0, 359.0)
     result = FrameResult((lane,), EgoLane(5, None), 100.0)
     picture = DecodedImage(np.zeros((360, 640, 3), np.uint8), reduction=2)
@@ -55,7 +56,7 @@ def test_lanes_of_a_reduced_picture_are_told_in_pixels_of_its_file() -> None:
     assert (frame.size, frame.result.horizon, moved.top, moved.bottom) == ((1280, 720), 200.5, 240.5, 718.5)
     for row in (130.0, 200.0, 359.0):
         assert moved.curve.x(2.0 * row + 0.5) == pytest.approx(2.0 * float(lane.curve.x(row)) + 0.5, abs=1e-9)
-        # What is known to a pixel of the reduced picture is known to two of the file.
+        # One pixel of the reduced image is two pixels of the file, so variances grow fourfold.
         before, after = (
             float(basis @ covariance @ basis)
             for basis, covariance in (
@@ -78,7 +79,7 @@ def test_lanes_of_a_reduced_picture_are_told_in_pixels_of_its_file() -> None:
 def test_curves_and_points_are_exact(horizon: float, v: float, b: float, k: float, top: float) -> None:
     curve = Curve(horizon, (v, b, k))
     top_row, bottom = horizon + top * (2159.0 - horizon), 2159.0
-    (lane,) = told(FrameResult((boundary(curve, top_row, bottom),), EgoLane(), horizon)).lanes
+    (lane,) = as_message(FrameResult((boundary(curve, top_row, bottom),), EgoLane(), horizon)).lanes
     for y in np.linspace(top_row, bottom, 50):
         assert lane.x(float(y)) == pytest.approx(float(curve.x(y)), abs=0.01)
     for x, y in lane.points:

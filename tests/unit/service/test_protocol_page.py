@@ -1,4 +1,4 @@
-"""docs/protocol.md says what the code does: its messages are messages, its codes are the service's."""
+"""docs/protocol.md agrees with the code: its examples are valid messages, its tables list the service's codes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from lanestream.asyncapi import document
-from lanestream.errors import ProtocolError, told_errors
-from lanestream.protocol import MOST_SEQ, SUBPROTOCOL, Limits, parse_client_message, parse_server_message
+from lanestream.errors import ProtocolError, documented_errors
+from lanestream.protocol import MAX_SEQ, SUBPROTOCOL, Limits, parse_client_message, parse_server_message
 from lanestream.settings import Settings
 from lanestream.streaming.stream_protocol import StreamLimits
 
@@ -19,45 +19,46 @@ PAGE = (ROOT / "docs" / "protocol.md").read_text()
 EXAMPLES = re.findall(r"```json\n(.*?)```", PAGE, re.DOTALL)
 
 
-def test_every_example_is_a_message() -> None:
+def test_every_message_type_has_an_example() -> None:
     types = [json.loads(example)["type"] for example in EXAMPLES]
     assert set(types) == set(document()["components"]["messages"]) - {"image", "end"}
     assert '`{"type": "end"}`' in PAGE
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: json.loads(example)["type"])
-def test_an_example_is_understood(example: str) -> None:
+def test_an_example_is_a_valid_message(example: str) -> None:
     try:
         parse_client_message(example)
     except ProtocolError:
         parse_server_message(example)
 
 
-def test_the_table_of_errors_is_the_services() -> None:
+def test_the_table_of_errors_is_complete() -> None:
     rows = re.findall(r"^\| `(\w+)` \| (\d+) \| (\d+) \| (.*) \|$", PAGE, re.MULTILINE)
-    told = [
-        (code, str(answer.close_code), str(answer.http_status), why) for code, (why, answer) in told_errors().items()
+    errors = [
+        (code, str(status.close_code), str(status.http_status), meaning)
+        for code, (meaning, status) in documented_errors().items()
     ]
-    assert rows == told
+    assert rows == errors
 
 
-def test_the_table_of_closes_is_the_documents() -> None:
+def test_the_table_of_close_codes_agrees_with_asyncapi() -> None:
     rows = dict(re.findall(r"^\| (\d+) \| (.*) \|$", PAGE, re.MULTILINE))
     closes = document()["channels"]["stream"]["x-close-codes"]
-    assert {code: rows[code].replace("`max_bytes`", "the bytes that an image may have") for code in closes} == closes
+    assert {code: rows[code].replace("`max_bytes`", "the size limit of an image") for code in closes} == closes
 
 
-def test_the_numbers_are_those_of_the_defaults() -> None:
+def test_the_numbers_are_the_defaults() -> None:
     settings, limits = Settings(), StreamLimits()
     (ready,) = [json.loads(example) for example in EXAMPLES if '"ready"' in example]
     assert ready["limits"] == {name: getattr(settings, name) for name in Limits.model_fields}
     assert settings.handshake_s == 10.0
     assert "within 10 seconds" in PAGE
     assert (limits.frame_deadline_s, limits.burst_s) == (2.0, 2.0)
-    assert MOST_SEQ == 2**53 - 1
+    assert MAX_SEQ == 2**53 - 1
     assert f"`{SUBPROTOCOL}`" in PAGE
 
 
-def test_the_five_lines_are_those_of_the_readme() -> None:
+def test_the_five_lines_are_the_same_in_the_readme() -> None:
     (lines,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     assert lines in (ROOT / "README.md").read_text()

@@ -11,7 +11,8 @@ from pydantic_core import PydanticUndefined
 
 from lanestream.errors import SettingsError
 from lanestream.keys import ApiKey
-from lanestream.settings import Settings, load_settings, shown
+from lanestream.processors import processors
+from lanestream.settings import Settings, load_settings, to_toml
 
 OPERATIONS = Path(__file__).parents[3] / "docs" / "operations.md"
 DIGEST = "0123456789abcdef" * 4
@@ -23,7 +24,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path("lanestream.toml")
 
 
-def test_the_command_line_counts_before_the_environment_and_that_before_the_file(
+def test_the_command_line_overrides_the_environment_and_that_the_file(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file.write_text('port = 1\nhost = "::1"\ncredits = 2\nmodel = "m.onnx"\n')
@@ -35,7 +36,17 @@ def test_the_command_line_counts_before_the_environment_and_that_before_the_file
     assert found.max_bytes == Settings().max_bytes
 
 
-def test_the_file_can_be_named_by_a_variable(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_follow_from_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LANESTREAM_PORT", "81")
+    monkeypatch.setenv("LANESTREAM_CREDITS", "3")
+    monkeypatch.setenv("LANESTREAM_MODEL", "")
+    settings = load_settings(port=82, host=None)
+    assert (settings.port, settings.credits, settings.host, settings.model) == (82, 3, "127.0.0.1", None)
+    assert (settings.threads_per_process(1), settings.threads_per_process(2)) == (processors() + 1, 1)
+    assert settings.image_limits.max_bytes == settings.max_bytes
+
+
+def test_a_variable_can_name_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text("port = 1\n")
     monkeypatch.setenv("LANESTREAM_CONFIG", str(file))
     assert load_settings().port == 1
@@ -48,7 +59,7 @@ def test_the_file_can_be_named_by_a_variable(file: Path, monkeypatch: pytest.Mon
     "value",
     [f"a:{DIGEST},b:{DIGEST}", f"\na:{DIGEST}\n# c:{DIGEST}\n b:{DIGEST} \n", [f"a:{DIGEST}", f"b:{DIGEST}"]],
 )
-def test_keys_are_a_text_or_a_list(value: Any) -> None:
+def test_keys_are_a_string_or_a_list(value: Any) -> None:
     assert load_settings(api_keys=value).api_keys == (ApiKey("a", DIGEST), ApiKey("b", DIGEST))
 
 
@@ -61,37 +72,39 @@ def test_lists_come_from_variables_and_from_a_file(file: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("port = 'x'", "lanestream.toml: port = 'x': input should be a valid integer"),
         ("port = 70000", "lanestream.toml: port = 70000: input should be less than or equal to 65535"),
-        ("prot = 1", "lanestream.toml: prot is no setting ("),
-        ("config = 'x.toml'", "lanestream.toml: config can't be set in the file"),
-        ("port =", "lanestream.toml is no TOML: "),
-        ("api_keys = ['secret']", "lanestream.toml: api_keys: entry 1 is no key; NAME:SHA256 is expected"),
-        ("api_keys = [1]", "lanestream.toml: api_keys: a text or a list of texts is accepted"),
-        ("allowed_origins = '*'", "lanestream.toml: allowed_origins = '*': '*' is no origin"),
+        ("prot = 1", "lanestream.toml: prot is not a setting ("),
+        ("config = 'x.toml'", "lanestream.toml: a settings file can't set config"),
+        ("port =", "lanestream.toml is not valid TOML: "),
+        ("api_keys = ['secret']", "lanestream.toml: api_keys: entry 1 is not a valid key; expected NAME:SHA256"),
+        ("api_keys = [1]", "lanestream.toml: api_keys: expected a string or a list of strings"),
+        ("allowed_origins = '*'", "lanestream.toml: allowed_origins = '*': '*' is not a valid origin"),
         ("allowed_origins = ['https://a.b/c']", "lanestream.toml: allowed_origins = ['https://a.b/c']: "),
     ],
 )
-def test_a_mistake_in_the_file_is_told_in_a_line(file: Path, text: str, said: str) -> None:
+def test_a_mistake_in_the_file_is_reported_on_one_line(file: Path, text: str, message: str) -> None:
     file.write_text(text)
     with pytest.raises(SettingsError) as caught:
         load_settings(config=file)
-    assert str(caught.value).startswith(said)
+    assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
     assert "secret" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("data", "said"), [(None, "can't read .*: no such file"), (b"\xff\xfe", "is no text")])
-def test_a_file_that_can_not_be_read_is_told(file: Path, data: bytes | None, said: str) -> None:
+@pytest.mark.parametrize(
+    ("data", "message"), [(None, "can't read .*: no such file"), (b"\xff\xfe", "is not a UTF-8 text file")]
+)
+def test_an_unreadable_file_is_reported(file: Path, data: bytes | None, message: str) -> None:
     if data is not None:
         file.write_bytes(data)
-    with pytest.raises(SettingsError, match=said):
+    with pytest.raises(SettingsError, match=message):
         load_settings(config=file)
 
 
-def test_the_place_of_a_mistake_is_named(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_source_of_an_invalid_value_is_named(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text("port = 1\n")
     monkeypatch.setenv("LANESTREAM_PORT", "many")
     with pytest.raises(SettingsError, match=r"^LANESTREAM_PORT = 'many': "):
@@ -99,15 +112,15 @@ def test_the_place_of_a_mistake_is_named(file: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(SettingsError, match=r"^--max-sessions = 0: "):
         load_settings(config=file, port=2, max_sessions=0)
     monkeypatch.setenv("LANESTREAM_API_KEYS", "a:secret")
-    with pytest.raises(SettingsError, match=r"^LANESTREAM_API_KEYS: entry 1 is no key") as caught:
+    with pytest.raises(SettingsError, match=r"^LANESTREAM_API_KEYS: entry 1 is not a valid key") as caught:
         load_settings(port=1)
     assert "secret" not in str(caught.value)
 
 
-def test_what_is_shown_is_a_file_with_all_settings_and_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_toml_output_has_all_settings_and_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LANESTREAM_API_KEYS", f"camera-7:{DIGEST}")
     found = load_settings(port=1, host="::1", model=Path("m.onnx"), allowed_origins="https://a.b")
-    text = shown(found)
+    text = to_toml(found)
     values = tomllib.loads(text)
     assert (values["port"], values["host"], values["model"]) == (1, "::1", "m.onnx")
     assert values["api_keys"] == ["camera-7:***"]
@@ -115,12 +128,27 @@ def test_what_is_shown_is_a_file_with_all_settings_and_no_secret(monkeypatch: py
     assert "# regressor is not set" in text.splitlines()
     names = [line.removeprefix("# ").split()[0] for line in text.splitlines()]
     assert names == list(Settings.model_fields)
-    for secret_safe in (text, repr(found), str(found)):
-        assert DIGEST[:8] not in secret_safe
+    for output in (text, repr(found), str(found)):
+        assert DIGEST[:8] not in output
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("name", "value"), [("PORT", "99999"), ("PROVIDER", "tpu"), ("THREADS", "0"), ("MAX_BYTES", "x")]
+)
+def test_an_invalid_variable_is_named(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setenv(f"LANESTREAM_{name}", value)
+    with pytest.raises(SettingsError, match=f"^LANESTREAM_{name} = '{value}': input should be") as caught:
+        load_settings()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_empty_variable_counts_as_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LANESTREAM_HOST", "")
+    assert load_settings() == Settings()
+
+
+@pytest.mark.parametrize(
+    ("url", "masked"),
     [
         ("redis://host:6379/0", "redis://host:6379/0"),
         ("redis://user:secret@host/0", "redis://***@host/0"),
@@ -128,22 +156,21 @@ def test_what_is_shown_is_a_file_with_all_settings_and_no_secret(monkeypatch: py
         ("redis://host/0?password=secret", "redis://host/0?***"),
     ],
 )
-def test_passwords_in_urls_are_masked(monkeypatch: pytest.MonkeyPatch, url: str, told: str) -> None:
+def test_passwords_in_urls_are_masked(monkeypatch: pytest.MonkeyPatch, url: str, masked: str) -> None:
     monkeypatch.setenv("LANESTREAM_REDIS_URL", url)
-    assert tomllib.loads(shown(load_settings()))["redis_url"] == told
+    assert tomllib.loads(to_toml(load_settings()))["redis_url"] == masked
 
 
-def test_the_manual_has_every_setting() -> None:
-    """The table of settings in the manual; a row that is missing is printed as it has to be."""
+def test_the_operations_page_has_every_setting() -> None:
     rows = [line for line in OPERATIONS.read_text().splitlines() if line.startswith("| `LANESTREAM_")]
     assert rows == [_row(name) for name in Settings.model_fields]
 
 
 def _row(name: str) -> str:
     field = Settings.model_fields[name]
-    default = "the machine's" if field.default is PydanticUndefined else _told(field.default)
+    default = "the machine's" if field.default is PydanticUndefined else _shown(field.default)
     return f"| `LANESTREAM_{name.upper()}` | {default} | {field.description} |"
 
 
-def _told(default: object) -> str:
+def _shown(default: object) -> str:
     return "" if default in (None, ()) else f"{default:.12g}" if isinstance(default, int | float) else str(default)

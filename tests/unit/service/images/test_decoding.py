@@ -28,7 +28,7 @@ def png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
 
 
-def error_of(data: bytes, limits: ImageLimits = LIMITS) -> str:
+def error_from_code(data: bytes, limits: ImageLimits = LIMITS) -> str:
     with pytest.raises(ImageError) as caught:
         decode(data, limits)
     assert "\n" not in str(caught.value)
@@ -77,7 +77,7 @@ def test_a_truncated_file_is_refused(kind: str) -> None:
     for size in {*range(12, 60), *range(60, len(data) - 12, 41)}:
         with pytest.raises(ImageError, match=r"cut short|corrupt|format is unknown"):
             decode(data[:size], LIMITS)
-    assert "its end is missing" in error_of(data[:-13])
+    assert "its end is missing" in error_from_code(data[:-13])
 
 
 def test_bytes_after_the_end_are_ignored() -> None:
@@ -89,7 +89,7 @@ def test_an_end_marker_in_a_preview_is_not_the_end() -> None:
     preview = b"\xff\xe1" + struct.pack(">H", 2 + len(data)) + data
     whole = data[:2] + preview + data[2:]
     assert decode(whole, LIMITS).shape == (180, 320, 3)
-    assert "cut short" in error_of(whole[: 2 + len(preview) + 300])
+    assert "cut short" in error_from_code(whole[: 2 + len(preview) + 300])
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_an_end_marker_in_a_preview_is_not_the_end() -> None:
     ],
 )
 def test_corrupt_files_are_reported_as_corrupt(data: bytes) -> None:
-    assert "is corrupt" in error_of(data)
+    assert "is corrupt" in error_from_code(data)
 
 
 @pytest.mark.parametrize(
@@ -120,12 +120,12 @@ def test_corrupt_files_are_reported_as_corrupt(data: bytes) -> None:
     ],
 )
 def test_the_error_for_other_files_names_the_accepted_formats(data: bytes, why: str) -> None:
-    assert error_of(data) == f"not an image: {why} (JPEG, PNG or WebP are accepted)"
+    assert error_from_code(data) == f"not an image: {why} (JPEG, PNG or WebP are accepted)"
 
 
 def test_sizes_are_checked_before_anything_is_decoded() -> None:
-    assert "1 x 1" in error_of(png(1, 1))
-    assert "63 x 5000" in error_of(png(63, 5000))
+    assert "1 x 1" in error_from_code(png(1, 1))
+    assert "63 x 5000" in error_from_code(png(63, 5000))
     with pytest.raises(ImageTooLargeError, match="30000 x 30000, 900,000,000 pixels; at most 9,437,184"):
         decode(png(30_000, 30_000), LIMITS)
     with pytest.raises(ImageTooLargeError, match="1,001 bytes; at most 1,000"):
@@ -140,7 +140,7 @@ def test_the_documented_sizes_are_accepted(width: int, height: int) -> None:
 def test_a_jpeg_with_too_many_scans_is_refused() -> None:
     data = fakes.image_file()
     scan = b"\xff\xda" + struct.pack(">H", 8) + bytes(6)
-    assert "more than 100 scans" in error_of(data[:-2] + 101 * scan + data[-2:])
+    assert "more than 100 scans" in error_from_code(data[:-2] + 101 * scan + data[-2:])
 
 
 def rotated(data: bytes) -> bytes:

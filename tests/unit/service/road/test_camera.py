@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from lanestream.errors import ProtocolError
 from lanestream.messages import ProcessedFrame, lanes_message
-from lanestream.protocol import CameraModel, LanesMessage, StartMessage, parse_client_message, schemas
+from lanestream.protocol import CameraModel, LanesMessage, StartMessage, json_schemas, parse_client_message
 from lanestream.road.camera import Camera
 from lanestream.road.curve import Curve
 from lanestream.road.results import EgoLane, FrameResult, LaneBoundary
@@ -168,7 +168,7 @@ def test_programs_are_told_of_a_bad_camera_where_they_make_it() -> None:
 
 
 def test_the_schemas_have_it() -> None:
-    told = schemas()
+    told = json_schemas()
     camera = told["client"]["$defs"]["CameraModel"]["properties"]
     assert (camera["height"]["minimum"], camera["height"]["maximum"]) == (0.3, 4.0)
     assert (camera["field_of_view"]["minimum"], camera["field_of_view"]["maximum"]) == (20.0, 150.0)

@@ -24,8 +24,8 @@ from lanestream.errors import (
     LanestreamError,
     NoDetectorError,
     WorkerLostError,
-    error_of,
-    told_errors,
+    documented_errors,
+    error_from_code,
 )
 from lanestream.images.decoding import ImageLimits
 from lanestream.workers.capabilities import Capabilities
@@ -220,8 +220,8 @@ async def test_workers_end_with_the_service(monkeypatch: pytest.MonkeyPatch) -> 
 def test_all_errors_of_ours_travel() -> None:
     here, there = socket.socketpair()
     with here, there:
-        for code in told_errors():
-            here.sendall(packed(portable(error_of(code, "what was wrong", "what to do"))))
+        for code in documented_errors():
+            here.sendall(packed(portable(error_from_code(code, "what was wrong", "what to do"))))
             error = receive(there)
             assert (error.code, error.message, error.hint) == (code, "what was wrong", "what to do")
 
