@@ -1,6 +1,6 @@
 """Writes the contract of the stream as an AsyncAPI document. Validates it first if a schema is given.
 
-python tools/asyncapi.py docs/asyncapi.yaml [SCHEMA]     SCHEMA: json_schemas/3.0.0.json of the npm package @asyncapi/specs
+python tools/asyncapi.py docs/asyncapi.yaml [SCHEMA]     SCHEMA: schemas/3.0.0.json of the npm package @asyncapi/specs
 """
 
 from __future__ import annotations

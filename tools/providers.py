@@ -14,6 +14,7 @@ from typing import Final
 
 import click
 import numpy as np
+from lanestream.runtime import PROVIDERS, RuntimeOptions
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
@@ -22,7 +23,6 @@ from rich.table import Table
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
 from lanestream.errors import ProviderError
 from lanestream.inference import LoadedModel, load_model
-from lanestream.runtime import PROVIDERS, RuntimeOptions
 from lanestream_exporter.scenes import render_still, sample_scene
 
 _FILES: Final = (SHIPPED_MODEL, SHIPPED_MODEL.with_name("classifier-fp32.onnx"), SHIPPED_REGRESSOR)

@@ -19,13 +19,13 @@ from typing import Literal
 
 from lanestream.errors import DrainingError, ImageTooLargeError, LostError, ProtocolError, error_from_code
 from lanestream.protocol import (
-    ServerMessage,
     DrainingMessage,
     EndMessage,
     ErrorMessage,
     FrameMessage,
     LanesMessage,
     ReadyMessage,
+    ServerMessage,
     StartMessage,
     SummaryMessage,
     error_message,

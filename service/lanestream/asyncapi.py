@@ -14,7 +14,7 @@ from lanestream import __version__
 from lanestream.errors import documented_errors
 from lanestream.protocol import KEY_SUBPROTOCOL, SUBPROTOCOL, ClientMessage, Message, ServerMessage
 
-_SCHEMAS: Final = "#/components/json_schemas/"
+_SCHEMAS: Final = "#/components/schemas/"
 _STREAM: Final = "#/channels/stream"
 _CLIENT: Final[tuple[type[Message], ...]] = get_args(ClientMessage)
 _SERVER: Final[tuple[type[Message], ...]] = get_args(ServerMessage)
@@ -27,7 +27,7 @@ _CLOSE_CODES: Final[dict[int, str]] = {
 
 
 class _Draft7(GenerateJsonSchema):
-    """Generates json_schemas in the dialect that AsyncAPI requires."""
+    """Generates schemas in the dialect that AsyncAPI requires."""
 
     def tuple_schema(self, schema: core_schema.TupleSchema) -> JsonSchemaValue:
         """Lists the items of a tuple as `items`, where newer dialects use `prefixItems`."""
@@ -53,7 +53,7 @@ def document() -> dict[str, Any]:
         "operations": _operations(),
         "components": {
             "messages": {**_messages(), "image": _image()},
-            "json_schemas": _schemas(),
+            "schemas": _schemas(),
             "securitySchemes": _security(),
         },
     }
@@ -169,11 +169,11 @@ def _image() -> dict[str, Any]:
 
 
 def _schemas() -> dict[str, Any]:
-    """Returns the json_schemas of the text messages and their parts. Clients may omit defaults; the service never does."""
+    """Returns the schemas of the text messages and their parts. Clients may omit defaults; the service never does."""
     models: list[tuple[type[Message], JsonSchemaMode]] = [
         *((model, "validation") for model in _CLIENT),
         *((model, "serialization") for model in _SERVER),
     ]
-    _, json_schemas = models_json_schema(models, ref_template=f"{_SCHEMAS}{{model}}", schema_generator=_Draft7)
-    definitions: dict[str, Any] = json_schemas["$defs"]
+    _, schemas = models_json_schema(models, ref_template=f"{_SCHEMAS}{{model}}", schema_generator=_Draft7)
+    definitions: dict[str, Any] = schemas["$defs"]
     return definitions

@@ -20,8 +20,8 @@ import click
 
 from lanestream import __version__
 from lanestream.errors import LanestreamError, needs_extra
+from lanestream.inference.providers import AUTO, PROVIDER_NAMES
 from lanestream.keys import new_key
-from lanestream.runtime import PROVIDERS
 
 if TYPE_CHECKING:
     from lanestream.local import LocalEngine
@@ -109,7 +109,7 @@ def cli(context: click.Context) -> None:
     metavar="FILE|none",
     help="ONNX file of the regressor, or none  [default: the built-in one]",
 )
-@click.option("--provider", type=click.Choice(PROVIDERS), help="Execution provider  [default: auto]")
+@click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="Execution provider  [default: auto]")
 @click.option("--max-sessions", type=click.IntRange(1), help="Maximum number of concurrent streams  [default: 64]")
 @click.option("--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 per line.")
 @click.option("--log-format", type=click.Choice(["text", "json"]), help="Log format  [default: text]")
@@ -185,10 +185,10 @@ def _terminate(*_: object) -> None:
 
 def _load_local_engine(model: Path | None, provider: str | None, regressor: Path | None) -> LocalEngine:
     """Loads an engine for the commands that work in this process; see LoadEngine in the client."""
-    chosen = next((known for known in PROVIDERS if known == (provider or "auto")), None)
+    chosen = next((known for known in PROVIDER_NAMES if known == (provider or AUTO)), None)
     if chosen is None:
         raise click.BadParameter(
-            f"{provider!r} is not one of {', '.join(PROVIDERS)}.",
+            f"{provider!r} is not one of {', '.join(PROVIDER_NAMES)}.",
             ctx=click.get_current_context(),
             param_hint="'--provider'",
         )

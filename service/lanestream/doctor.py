@@ -23,13 +23,14 @@ from lanestream.engine import SHIPPED_MODEL, resolve_regressor
 from lanestream.errors import LanestreamError
 from lanestream.gpu import Gpu, gpu
 from lanestream.host import Cpu, cpu
-from lanestream.inference import LoadedModel, RegressorInfo, load_model
-from lanestream.inference.providers import NAMES, offered
-from lanestream.runtime import PROVIDERS, Provider
+from lanestream.inference.loaded_model import LoadedModel
+from lanestream.inference.loading import load_model
+from lanestream.inference.model_info import RegressorInfo
+from lanestream.inference.providers import AUTO, PROVIDER_NAMES, PROVIDERS, Installed
 from lanestream.settings import Settings, load_settings
 
 _PACKAGES: Final = ("onnxruntime", "onnxruntime-gpu", "openvino", "numpy", "opencv-python-headless")
-# The batch sizes to time, as far as they are among a model's buckets.
+# The batch sizes to time, as far as they are among a model's batch sizes.
 _BATCH_SIZES: Final = (1, 2, 4, 8, 12, 16, 32, 64)
 _RUNS_PER_BATCH_SIZE: Final = 9
 # Without a terminal, lines are this wide, so that paths and reasons are not broken.
@@ -71,16 +72,19 @@ class Diagnosis:
     cpu: Cpu
     gpu: Gpu
     installed: tuple[str, ...]
-    asked: Provider
+    asked: str
     networks: tuple[NetworkReport, ...]
     problem: str | None
 
 
 @click.command()
 @click.option(
-    "--require", "required", type=click.Choice(PROVIDERS[1:]), help="Fail unless all networks run on this provider."
+    "--require",
+    "required",
+    type=click.Choice(PROVIDER_NAMES[1:]),
+    help="Fail unless all networks run on this provider.",
 )
-@click.option("--provider", type=click.Choice(PROVIDERS), help="The provider to run on  [default: auto]")
+@click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="The provider to run on  [default: auto]")
 @click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
 @click.option(
     "--regressor",
@@ -91,7 +95,7 @@ class Diagnosis:
 @click.option("--config", type=click.Path(path_type=Path), help="TOML file of settings, as for `serve`.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 @click.pass_context
-def doctor(context: click.Context, /, required: Provider | None, as_json: bool, **given: Any) -> None:
+def doctor(context: click.Context, /, required: str | None, as_json: bool, **given: Any) -> None:
     """Show what the networks run on and how fast they are, with the same settings as `serve`."""
     diagnosis = diagnose(load_settings(**given), required)
     if as_json:
@@ -108,20 +112,20 @@ def doctor(context: click.Context, /, required: Provider | None, as_json: bool, 
         context.exit(1)
 
 
-def diagnose(settings: Settings, required: Provider | None = None) -> Diagnosis:
+def diagnose(settings: Settings, required: str | None = None) -> Diagnosis:
     """Loads and times the networks that a service with these `settings` would run.
 
     If the settings leave the provider to `auto`, the networks are asked to run on the `required` one. A network that
     can't be loaded or that runs on another provider than the required one is a problem.
     """
-    provider = required if required and settings.provider == "auto" else settings.provider
+    provider = required if required and settings.provider == AUTO else settings.provider
     networks: list[NetworkReport] = []
     problem = None
     try:
         networks.extend(_load_networks(settings, provider))
     except LanestreamError as error:
         problem = str(error)
-    elsewhere = [network for network in networks if required not in (None, "auto", network.provider)]
+    elsewhere = [network for network in networks if required not in (None, AUTO, network.provider)]
     if elsewhere and problem is None:
         network = elsewhere[0]
         problem = f"{network.name} runs on {network.provider}, not on {required}: {network.reason}"
@@ -139,7 +143,7 @@ def tables(diagnosis: Diagnosis) -> Iterator[Table]:
         yield _run_times(network)
 
 
-def _load_networks(settings: Settings, provider: Provider) -> Iterator[NetworkReport]:
+def _load_networks(settings: Settings, provider: str) -> Iterator[NetworkReport]:
     network, report = _load_network(settings.model or SHIPPED_MODEL, provider, settings)
     yield report
     regressor = resolve_regressor(settings.regressor)
@@ -147,7 +151,7 @@ def _load_networks(settings: Settings, provider: Provider) -> Iterator[NetworkRe
         yield _load_network(regressor, provider, settings)[1]
 
 
-def _load_network(path: Path, provider: Provider, settings: Settings) -> tuple[LoadedModel, NetworkReport]:
+def _load_network(path: Path, provider: str, settings: Settings) -> tuple[LoadedModel, NetworkReport]:
     started = time.perf_counter()
     network = load_model(path, provider, settings.runtime_options)
     loaded = time.perf_counter()
@@ -167,7 +171,7 @@ def _load_network(path: Path, provider: Provider, settings: Settings) -> tuple[L
         nodes=placement.nodes,
         load_ms=1e3 * (loaded - started),
         warm_up_ms=1e3 * (warm - loaded),
-        run_ms={size: _median_run_ms(network, size) for size in _BATCH_SIZES if size in network.buckets},
+        run_ms={size: _median_run_ms(network, size) for size in _BATCH_SIZES if size in placement.batch_sizes},
     )
     return network, report
 
@@ -193,9 +197,8 @@ def _software() -> Mapping[str, str]:
 
 
 def _installed_providers() -> tuple[str, ...]:
-    offer = offered()
-    names = [name for name, known in NAMES.items() if known in offer.onnxruntime]
-    return (*names, *(["openvino"] if offer.openvino else []))
+    installed = Installed.here()
+    return tuple(spec.name for spec in PROVIDERS if spec.is_installed(installed))
 
 
 def _cpu_rows(cpu: Cpu) -> list[tuple[str, str]]:

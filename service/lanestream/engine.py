@@ -93,16 +93,18 @@ def load_engine(
 ) -> Engine:
     """Loads the model file at `model`, by default the shipped classifier, and warms it up.
 
-    A classifier works with the `regressor`, which shows it where to search and is a detector itself; None leaves it out.
-    A regressor as the `model` is the only detector. Raises ModelError for a file that cannot be served, ProviderError if
-    `provider` cannot be used.
+    A classifier works with the `regressor`, which shows it where to search and is a detector itself; None leaves it
+    out. A regressor as the `model` is the only detector. Raises ModelError for a file that cannot be served,
+    ProviderError if `provider` cannot be used.
     """
     main = load_model(model or SHIPPED_MODEL, provider, options)
     models: dict[ModelRole, LoadedModel] = {main.info.kind: main}
     if main.info.kind == "classifier" and regressor is not None:
         models["regressor"] = load_model(regressor, provider, options)
         if not isinstance(models["regressor"].info, RegressorInfo):
-            raise ModelError(f"{regressor} is a {models['regressor'].info.kind}, not a regressor", "give one, or `none`")
+            raise ModelError(
+                f"{regressor} is a {models['regressor'].info.kind}, not a regressor", "give one, or `none`"
+            )
     for loaded in models.values():
         loaded.warm_up()
     return Engine.of(models)

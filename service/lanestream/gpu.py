@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from lanestream.inference.providers import cuda_version, preload_gpu_libraries
+from lanestream.inference.onnx_model import preload_gpu_libraries
+from lanestream.inference.providers import cuda_version
 
 _QUERY: Final = ("--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
 _NVIDIA_SMI_TIMEOUT_S: Final = 10.0

@@ -25,8 +25,8 @@ class SessionState:
     """What a session remembers, as a small value.
 
     `size` is the width and height of its working images, `horizon` the camera's and `prior_horizon` the one that the
-    ego-lane prior saw in the last frame, both as shares of the height. `evidence` is how much the frames have said about
-    the horizon.
+    ego-lane prior saw in the last frame, both as shares of the height. `evidence` is how much the frames have said
+    about the horizon.
     """
 
     size: tuple[int, int] | None = None
@@ -39,8 +39,8 @@ class SessionState:
 class Session:
     """Tracks the lanes of one camera, frame by frame.
 
-    `horizon` is its row as a share of the image height, if the caller knows it; otherwise it is estimated from the frames
-    and smoothed over time. A frame of another size than the last one resets the tracker.
+    `horizon` is its row as a share of the image height, if the caller knows it; otherwise it is estimated from the
+    frames and smoothed over time. A frame of another size than the last one resets the tracker.
     """
 
     def __init__(self, detector: Detector, horizon: float | None = None) -> None:

@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
-from pydantic import BeforeValidator, Field, SecretStr, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -24,8 +24,8 @@ from pydantic_settings import (
 from lanestream.errors import SettingsError
 from lanestream.host import network_threads, processors
 from lanestream.images.decoding import MOST_PIXELS, ImageLimits
+from lanestream.inference.providers import AUTO, PROVIDER_NAMES, RuntimeOptions
 from lanestream.keys import ApiKey, parse_keys
-from lanestream.runtime import Provider, RuntimeOptions
 from lanestream.streaming.session_registry import SessionLimits
 from lanestream.streaming.stream_protocol import StreamLimits
 
@@ -70,6 +70,13 @@ def _split(value: object) -> list[str]:
     return [part.strip() for text in texts for line in text.splitlines() for part in line.split(",")]
 
 
+def _provider(name: str) -> str:
+    """Returns the name of an execution provider, or `auto`. Raises ValueError for any other."""
+    if name not in PROVIDER_NAMES:
+        raise ValueError(f"{name!r} is not a provider; {', '.join(PROVIDER_NAMES)} are accepted")
+    return name
+
+
 class Settings(BaseSettings):
     """The settings of the service. Each is read from LANESTREAM_<NAME>, or by its name from the file `config`."""
 
@@ -85,7 +92,9 @@ class Settings(BaseSettings):
     regressor: Path | None = Field(
         default=None, description="ONNX file of the regressor, or `none`; the shipped one if not set."
     )
-    provider: Provider = Field(default="auto", description="Execution provider of the networks.")
+    provider: Annotated[str, AfterValidator(_provider)] = Field(
+        default=AUTO, description="Execution provider of the networks."
+    )
     inference_threads: int | None = Field(
         default=None,
         ge=1,

@@ -162,9 +162,9 @@ def test_every_network_is_told_the_default_first(both_url: str) -> None:
 
 
 def test_the_schemas_and_the_documentation_are_there(url: str) -> None:
-    json_schemas = httpx.get(f"{url}/v1/schema").json()
-    assert "LanesMessage" in json_schemas["server"]["$defs"]
-    detectors = json_schemas["client"]["$defs"]["StartMessage"]["properties"]["detector"]["anyOf"]
+    schemas = httpx.get(f"{url}/v1/schema").json()
+    assert "LanesMessage" in schemas["server"]["$defs"]
+    detectors = schemas["client"]["$defs"]["StartMessage"]["properties"]["detector"]["anyOf"]
     assert {"enum": ["candidates", "regression"], "type": "string"} in detectors
     content = httpx.get(f"{url}/openapi.json").json()["paths"]["/v1/detect"]["post"]["requestBody"]["content"]
     assert {"image/jpeg", "multipart/form-data"} <= set(content)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import click
+from lanestream.runtime import PROVIDERS, Provider
 
 from bench.frames import load_clips
 from bench.measure import benchmark, run_suite
@@ -15,7 +16,6 @@ from bench.report import markdown, report
 from bench.runners import litserve_installed
 from bench.workload import QUICK, Suite
 from lanestream.errors import LanestreamError
-from lanestream.runtime import PROVIDERS, Provider
 
 
 @click.command()

@@ -14,6 +14,7 @@ from itertools import count
 from multiprocessing.connection import Connection
 
 import cv2
+from lanestream.runtime import Provider
 
 from bench.frames import FPS, Clips, forward_and_backward
 from bench.workload import PIPELINE, POOL, LoadRequest, LoadResult, Reply
@@ -22,7 +23,6 @@ from lanestream.engine import Engine, load_engine
 from lanestream.images.decoding import ImageLimits, decode
 from lanestream.local import LocalCamera, LocalEngine
 from lanestream.logs import log_config
-from lanestream.runtime import Provider
 from lanestream.settings import load_settings
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import litserve
 import numpy as np
+from lanestream.runtime import Provider
 
 from lanestream.detection import Question, Steps, in_one
 from lanestream.detection.features import WORKING_WIDTH
@@ -16,7 +17,6 @@ from lanestream.engine import load_engine
 from lanestream.images.decoding import DecodedImage, ImageLimits, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.road.results import FrameResult
-from lanestream.runtime import Provider
 
 # LitServe's documentation uses batches of 8 that wait 50 to 100 ms. A shorter wait is better with few clients.
 MAX_BATCH_SIZE: Final = 8

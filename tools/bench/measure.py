@@ -11,12 +11,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+from lanestream.runtime import Provider
+
 from bench.frames import Clips
 from bench.in_process import PipelineInfo, run_pipeline
 from bench.load_generator import generate
 from bench.runners import HelperProcess, ProcessTree, Server, server_programs
 from bench.workload import IN_PROCESS, LARGE, SERVICE, LoadRequest, Reply, Suite, Workload
-from lanestream.runtime import Provider
 
 # Two load generators, so that one burst of replies to many sessions does not wait for a single process.
 GENERATORS: Final = 2

@@ -18,10 +18,10 @@ from typing import Any, Final
 import httpx
 import psutil
 from demo import LANESTREAM, free_port, stop
+from lanestream.runtime import Provider
 
 from bench.workload import BASELINE, LITSERVE, SERVICE, LoadRequest, LoadResult, Transport
 from lanestream.detection.proposals import CandidateSearch
-from lanestream.runtime import Provider
 
 READY_S: Final = 120.0
 # More than any suite needs, so that the service's own limits are not measured. Streams break off after each workload

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from lanestream.runtime import RuntimeOptions
 from numpy.typing import NDArray
 
 from lanestream.detection import Detector
 from lanestream.inference import OnnxModel, load_model
 from lanestream.inference.providers import offered, without_gpus
 from lanestream.road.results import Detection
-from lanestream.runtime import RuntimeOptions
 from lanestream_exporter.exporting.exportable import MetricValues, ValidationSet
 
 BATCH_SIZES: Final = (1, 4, 16)

@@ -25,7 +25,7 @@ from lanestream.errors import (
 
 if TYPE_CHECKING:
     from lanestream.inference.batcher import BatchReport
-    from lanestream.workers.capabilities import Offer
+    from lanestream.workers.capabilities import DetectorInfo
 
 DropReason = Literal["superseded", "expired", "overload", "decode_error", "too_large", "rate", "disconnected", "error"]
 ResumeResult = Literal["resumed", "unknown", "refused"]
@@ -123,8 +123,8 @@ class Metrics:
 
     def batch(self, report: BatchReport) -> None:
         """Counts a batch that a network has run."""
-        self._batch_size.labels(report.network).observe(report.rows)
-        self._batch_wait.labels(report.network).observe(report.oldest_s)
+        self._batch_size.labels(report.model).observe(report.inputs)
+        self._batch_wait.labels(report.model).observe(report.longest_wait_s)
         self._queue.set(report.still_waiting)
 
     def session_opened(self) -> None:
@@ -151,9 +151,9 @@ class Metrics:
         """Counts an error sent to a client."""
         self._refusals.labels(code).inc()
 
-    def loaded(self, offer: Offer) -> None:
+    def loaded(self, info: DetectorInfo) -> None:
         """Reports a detector that is ready, and its network."""
-        network = offer.network
+        network = info.model
         device = "gpu" if network.provider in _ON_GPU else "cpu"
         metadata = network.metadata
         self._provider.labels(network.name, network.provider, device, metadata.get("precision", "unknown")).set(1)

@@ -1,4 +1,4 @@
-"""Single requests: the lanes of one image, the loaded models, readiness, metrics and json_schemas."""
+"""Single requests: the lanes of one image, the loaded models, readiness, metrics and schemas."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from lanestream.workers.frame_worker import EncodedFrame
 if TYPE_CHECKING:
     from lanestream.messages import ProcessedFrame
     from lanestream.streaming.session_registry import OpenSession
-    from lanestream.workers.capabilities import Offer
+    from lanestream.workers.capabilities import DetectorInfo
 
 # Open to everyone: health checks, and documents that are public anyway.
 public_router = APIRouter()
@@ -56,9 +56,9 @@ class NetworkEntry(BaseModel):
     provider: str
 
     @classmethod
-    def from_info(cls, info: Offer, **fields: Any) -> Self:
+    def from_info(cls, info: DetectorInfo, **fields: Any) -> Self:
         """Returns the entry of a detector's network, with these further fields."""
-        return cls(name=info.network.name, detector=info.detector, provider=info.network.provider, **fields)
+        return cls(name=info.model.name, detector=info.detector, provider=info.model.provider, **fields)
 
 
 class ModelEntry(NetworkEntry):
@@ -144,7 +144,7 @@ async def detect(
     pool = service.pool
     media_type = _response_media_type(request, service)
     # Requests that fail anyway are refused before their body is read, and a slow body does not occupy a session.
-    pool.offers.chosen(detector)
+    pool.capabilities.select(detector)
     service.sessions.check_limits(caller)
     data = await service.bodies.read_image(request)
     with service.sessions.temporary(pool, caller, horizon, detector) as session:
@@ -152,7 +152,7 @@ async def detect(
     message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
     if media_type == _JSON:
         return Response(message.model_dump_json(), media_type=_JSON)
-    picture = await pool.work(_draw_picture, service, data, message, media_type)
+    picture = await pool.in_thread(_draw_picture, service, data, message, media_type)
     return Response(picture, media_type=media_type)
 
 
@@ -160,8 +160,8 @@ async def detect(
 async def models(request: Request) -> ModelList:
     """Returns the loaded networks and the providers that run them, the default detector's first."""
     entries = [
-        ModelEntry.from_info(info, sha256=info.network.sha256, metadata=dict(info.network.metadata))
-        for info in _service(request).pool.offers.all
+        ModelEntry.from_info(info, sha256=info.model.sha256, metadata=dict(info.model.metadata))
+        for info in _service(request).pool.capabilities.detectors
     ]
     return ModelList(models=entries)
 
@@ -188,7 +188,7 @@ async def healthz() -> dict[str, str]:
 async def readyz(request: Request) -> Readiness:
     """Responds with 200 once the networks are loaded and warm, until the service is about to stop."""
     _service(request).check_ready()
-    networks = [NetworkEntry.from_info(info) for info in _service(request).pool.offers.all]
+    networks = [NetworkEntry.from_info(info) for info in _service(request).pool.capabilities.detectors]
     return Readiness(status="ready", provider=networks[0].provider, networks=networks)
 
 
@@ -247,8 +247,8 @@ async def _process(service: Service, session: OpenSession, image: EncodedFrame) 
     """Returns the lanes of an image. Counts the frame, processed or failed."""
     service.metrics.frame_received()
     try:
-        async with service.pool.turn():
-            frame = await service.pool.run(session.camera, image)
+        async with service.pool.admit():
+            frame = await service.pool.run(session.handle, image)
     except BaseException as error:
         service.metrics.frame_failed(error)
         raise

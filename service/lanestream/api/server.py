@@ -19,7 +19,7 @@ from lanestream.api.auth import warn_if_open
 from lanestream.api.header_timeout import with_header_timeout
 from lanestream.errors import SettingsError
 from lanestream.logs import log_config
-from lanestream.workers.ipc import Setup
+from lanestream.workers.ipc import WorkerSetup
 from lanestream.workers.process_pool import ProcessPool
 from lanestream.workers.thread_pool import ThreadPool
 
@@ -97,9 +97,9 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
     try:
         pool = await _start_pool(app.state.service, load)
         app.state.service.install(pool)
-        for offer in pool.offers.all:
-            network = offer.network
-            _log.info("detector %s: %s on %s (%s)", offer.detector, network.name, network.provider, network.reason)
+        for info in pool.capabilities.detectors:
+            network = info.model
+            _log.info("detector %s: %s on %s (%s)", info.detector, network.name, network.provider, network.reason)
         _log.info("ready")
     except BaseException:
         server.should_exit = True
@@ -115,5 +115,5 @@ async def _start_pool(service: Service, load: Callable[[], Engine]) -> WorkerPoo
         return ThreadPool(
             await asyncio.to_thread(load), settings.image_limits, settings.threads_per_process(1), observe
         )
-    setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
-    return await ProcessPool.started(setup, settings.processes, settings.threads_per_process, observe)
+    setup = WorkerSetup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
+    return await ProcessPool.start(setup, settings.processes, settings.threads_per_process, observe)

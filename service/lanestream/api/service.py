@@ -68,7 +68,7 @@ class Service:
 
     def install(self, pool: WorkerPool) -> None:
         """Makes the service ready with a warm worker pool."""
-        for detector in pool.offers.all:
+        for detector in pool.capabilities.detectors:
             self.metrics.loaded(detector)
         self.metrics.workers(lambda: pool.pids)
         self._pool = pool

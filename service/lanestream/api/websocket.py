@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from lanestream.messages import ProcessedFrame
     from lanestream.streaming.session_registry import Caller, OpenSession
     from lanestream.streaming.stream_protocol import IncomingFrame
-    from lanestream.workers.capabilities import Offer
+    from lanestream.workers.capabilities import DetectorInfo
 
 router = APIRouter()
 
@@ -148,7 +148,7 @@ class StreamConnection:
 
     async def _start(self, message: StartMessage, now: float) -> None:
         # Checked first, so that asking for a detector that is not loaded leaves the stream unchanged.
-        detector = self._service.pool.offers.chosen(message.detector)
+        detector = self._service.pool.capabilities.select(message.detector)
         self._service.check_ready()
         self._protocol.receive_start(message, now)
         session = await self._service.sessions.start(self._service.pool, self._caller, message)
@@ -159,7 +159,7 @@ class StreamConnection:
             self._protocol.resume(session.last_seq, session.stream_s, time.monotonic())
         await self._send(self._ready(session, detector))
 
-    def _ready(self, session: OpenSession, detector: Offer) -> ReadyMessage:
+    def _ready(self, session: OpenSession, detector: DetectorInfo) -> ReadyMessage:
         return ReadyMessage(
             session=session.id,
             resume_token=session.token or "",
@@ -167,8 +167,8 @@ class StreamConnection:
             last_seq=session.last_seq,
             mode=self._protocol.mode,
             detector=detector.detector,
-            model=detector.network.name,
-            provider=detector.network.provider,
+            model=detector.model.name,
+            provider=detector.model.provider,
             limits=self._service.limits,
         )
 
@@ -190,7 +190,7 @@ class StreamConnection:
             "resumed" if session.resumed else "opened",
             self._caller.identity,
             self._protocol.mode,
-            self._service.pool.offers.chosen(self._protocol.options.detector).detector,
+            self._service.pool.capabilities.select(self._protocol.options.detector).detector,
             extra=self._log_fields(),
         )
 
@@ -215,7 +215,7 @@ class StreamConnection:
     async def _answer_next(self) -> ServerMessage:
         """Waits for a slot in the worker pool and answers the frame that is next then."""
         self._protocol.request_slot()
-        async with self._service.pool.turn(fresh=self._protocol.mode == "latest"):
+        async with self._service.pool.admit(latest=self._protocol.mode == "latest"):
             frame = self._protocol.take_frame()
             assert frame is not None  # noqa: S101 - a waiting frame is replaced, never removed
             return await self._answer_frame(frame)
@@ -249,7 +249,7 @@ class StreamConnection:
         session.processing = True
         try:
             encoded = EncodedFrame(frame.data, frame.timestamp, frame.arrived, frame.deadline)
-            processed = await self._service.pool.run(session.camera, encoded)
+            processed = await self._service.pool.run(session.handle, encoded)
             session.last_seq, session.stream_s = frame.seq, self._protocol.stream_s(time.monotonic())
             return processed
         finally:

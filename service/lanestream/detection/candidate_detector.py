@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.curve_fit import fit_curves
-from lanestream.detection.interface import Detections, FrameContext, Infer
 from lanestream.detection.ego_prior import RoadRegressor
 from lanestream.detection.features import paint_gray
+from lanestream.detection.interface import Detections, FrameContext, Infer
 from lanestream.detection.patches import cut_patches
 from lanestream.detection.proposals import (
     MOST_CANDIDATES,

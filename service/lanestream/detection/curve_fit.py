@@ -1,9 +1,10 @@
 """The joint curve fit: moves the boundaries of a frame onto their paint, all together, to a fraction of a pixel.
 
-The marking filter finds bright bars row by row on a strip along each curve, and reweighted least squares pulls the curve
-onto them. Where paint is missing the curve itself is the prior, and so is the road that it shares with the others: on a
-flat road all boundaries have one vanishing point, one horizon and one curvature. A dashed line keeps its direction, and
-a far end behind a car has that of its neighbors. Between the two stripes of a double line lies its middle.
+The marking filter finds bright bars row by row on a strip along each curve, and reweighted least squares pulls the
+curve onto them. Where paint is missing the curve itself is the prior, and so is the road that it shares with the
+others: on a flat road all boundaries have one vanishing point, one horizon and one curvature. A dashed line keeps its
+direction, and a far end behind a car has that of its neighbors. Between the two stripes of a double line lies its
+middle.
 """
 
 from __future__ import annotations
@@ -81,11 +82,11 @@ def fit_curves(
     curves: Curves,
     spans: Spans,
     view: RoadView,
-    settings: FitSettings = FitSettings(),  # noqa: B008 - immutable
+    settings: FitSettings = FitSettings(),
     sigma: FloatArray | None = None,
     anchors: FloatArray = ANCHORS,
 ) -> Fits:
-    """Fits `curves` to the paint in a gray working image, within the rows where they are visible, or else their `spans`.
+    """Fits `curves` to the paint in a gray working image, in the rows where they are visible, or else in their `spans`.
 
     `sigma` (N, 3) are the deviations in pixels of the curves' columns at the `anchors`, if known.
     """
@@ -133,7 +134,8 @@ class _Strips:
         columns += self.x.astype(np.float32)[:, :, None]
         rows = np.broadcast_to(self.y.astype(np.float32)[:, :, None], columns.shape)
         maps = columns.reshape(-1, cells), rows.reshape(-1, cells)
-        strips = cv2.remap(gray, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(columns.shape)
+        warped = cv2.remap(gray, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        strips = np.asarray(warped, np.uint8).reshape(columns.shape)
         per_cell = (cells - 1) / float(self.across[-1] - self.across[0])
         contrast = np.empty(strips.shape, np.float32)
         # A strip that is wider by its obliquity has narrower bars; strips with bars of one width are filtered together.
@@ -143,12 +145,12 @@ class _Strips:
         for bar_widths, members in groups.items():
             filtered = bar_contrast(strips[members].reshape(-1, cells), bar_widths)
             contrast[members] = filtered.reshape(len(members), -1, cells)
-        # Five gray levels above its own row's texture is a bar that a person would see. Squared: a few bright dots count
-        # for more than a wheel track that is a little lighter all along.
+        # Five gray levels above its own row's texture is a bar that a person would see. Squared: a few bright dots
+        # count for more than a wheel track that is a little lighter all along.
         texture = np.abs(contrast).mean(axis=2, keepdims=True)
         place = int((1.0 - _BEST_ROWS) * (contrast.shape[1] - 1))
         best = np.maximum(np.partition(contrast.max(axis=2), place, axis=1)[:, place], 0.0)
-        bars = (contrast - texture) / (texture + (5.0 + _BEST_FACTOR * best)[:, None, None])
+        bars: NDArray[np.float32] = (contrast - texture) / (texture + (5.0 + _BEST_FACTOR * best)[:, None, None])
         np.clip(bars, 0.0, 1.0, out=bars)
         bars *= bars
         return bars
@@ -194,8 +196,9 @@ class _JointFit:
         horizon = expected
         columns = self._start
         theta = columns @ np.linalg.inv(_basis((self._rows - horizon) / depth)).T
-        road = np.array([np.median(theta[:, 0]), 0.0, np.median(theta[:, 2])])
-        solution = np.zeros(3 * number + 3)
+        road: FloatArray = np.array([np.median(theta[:, 0]), 0.0, np.median(theta[:, 2])])
+        solution: FloatArray = np.zeros(3 * number + 3)
+        road_sigma = _ROAD_SIGMA if settings.move_horizon else _ROAD_SIGMA * np.array([1.0, 1e-6, 1.0])
         for reach in settings.rounds:
             basis = _basis((self._rows - horizon) / depth)
             inverse = np.linalg.inv(basis)
@@ -203,16 +206,12 @@ class _JointFit:
             row_basis = _basis((self._strips.y - horizon) / depth)
             information, moment = self._paint(row_basis, start, columns @ inverse.T, reach, horizon)
             prior = np.einsum("ij,ni,ik->njk", basis, self._precision, basis)
-            if not settings.move_horizon:
-                road_sigma = np.array([_ROAD_SIGMA[0], 1e-9, _ROAD_SIGMA[2]])
-            else:
-                road_sigma = _ROAD_SIGMA
             known = np.array([np.median(start[:, 0]), expected - horizon, np.median(start[:, 2])])
             constraints, weights = self._weighted_constraints(inverse, start, solution, road, horizon)
             normal, right = self._normal_equations(prior + information, constraints, weights, known, road_sigma)
             right[: 3 * number] += moment.ravel()
             right -= constraints.T @ (weights * start[:, [0, 2]].ravel())
-            solution = np.linalg.solve(normal, right)
+            solution = np.asarray(np.linalg.solve(normal, right), float)
             columns = self._start + solution[: 3 * number].reshape(-1, 3) @ basis.T
             road = solution[-3:].copy()
             moved = horizon + road[1] - expected if settings.move_horizon else 0.0
@@ -226,7 +225,7 @@ class _JointFit:
             prior + information / _CORRELATED_ROWS, constraints, weights, known, road_sigma
         )
         covariance = np.linalg.inv(normal)[: 3 * number, : 3 * number].reshape(number, 3, number, 3)
-        own = covariance[np.arange(number), :, np.arange(number), :]
+        own: FloatArray = covariance[np.arange(number), :, np.arange(number), :]
         # From v, b, c in terms of t to v, b, k in terms of u.
         unit = np.array([1.0, 1.0 / depth, depth])
         fitted = Curves.through(horizon, self._rows, columns)
@@ -304,15 +303,15 @@ def _basis(t: FloatArray) -> FloatArray:
     return basis
 
 
-# --- Double lines ------------------------------------------------------------------------------------------------------
+# --- Double lines ---------------------------------------------------------------------------------------------------
 
 # A fit settles on the stripe that is seen better, on one in this frame and on the other in the next. Along the fit both
 # stripes are straight, so their contrast adds up over the rows, and each is a peak of the mean row. Strips along a fit:
 # reach, cells, rows, nearest share of the depth, widths of stripes.
 _STRIPE_REACH, _STRIPE_CELLS, _STRIPE_ROWS, _STRIPE_TOP_SHARE = 0.4, 129, 24, 0.2
 _STRIPE_WIDTHS: Final = (0.05, 0.09)
-# A stripe has this contrast in this share of the rows, and is no farther than this from the fit. The stripes of a double
-# line are this far apart.
+# A stripe has this contrast in this share of the rows, and is no farther than this from the fit. The stripes of a
+# double line are this far apart.
 _STRIPE_CONTRAST, _STRIPE_SHARE, _STRIPE_FARTHEST = 0.06, 0.3, 0.2
 _STRIPE_GAPS: Final = (0.07, 0.25)
 
@@ -328,9 +327,9 @@ def _between_stripes(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArra
     mean = bars.mean(axis=1)
     # A fit that is a little off lets a stripe move from cell to cell.
     shown = (bars > _STRIPE_CONTRAST).astype(np.uint8)
-    shown = cv2.dilate(shown.reshape(-1, _STRIPE_CELLS), np.ones((1, 3), np.uint8)).reshape(bars.shape)
+    shown = np.asarray(cv2.dilate(shown.reshape(-1, _STRIPE_CELLS), np.ones((1, 3), np.uint8)), np.uint8)
     is_stripe = (mean[:, 1:-1] >= mean[:, :-2]) & (mean[:, 1:-1] > mean[:, 2:])
-    is_stripe &= shown.mean(axis=1)[:, 1:-1] >= _STRIPE_SHARE
+    is_stripe &= shown.reshape(bars.shape).mean(axis=1)[:, 1:-1] >= _STRIPE_SHARE
     is_stripe &= np.abs(strips.across[1:-1]) <= _STRIPE_FARTHEST
     shift = np.zeros(len(fits.curves))
     for index in np.flatnonzero(is_stripe.sum(axis=1) >= 2).tolist():

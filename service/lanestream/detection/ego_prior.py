@@ -111,10 +111,8 @@ class EgoPrior:
         v, _, k = self.curves.coefficients.mean(axis=0).tolist()
         return VanishingPoint(v, self.view.horizon, k, 1.0)
 
-    def spacing(self, places: FloatArray, least: float) -> LaneSpacing | None:
-        """Returns the lanes beside the ego lane, whose boundaries have the lateral `places` (M,); None without any."""
-        if not self.sides:
-            return None
+    def spacing(self, places: FloatArray, least: float) -> LaneSpacing:
+        """Returns the lanes beside the ego lane, whose boundaries have the lateral `places` (M,). There must be one."""
         at = dict(zip(self.sides, places.tolist(), strict=True))
         left = at[-1] if -1 in at else at[1] - USUAL_LANE_WIDTH
         right = at[1] if 1 in at else at[-1] + USUAL_LANE_WIDTH
@@ -211,7 +209,7 @@ class RoadRegressor:
         return output, output.view(view)
 
     def crop(self, detail: Image, view: RoadView) -> NDArray[np.uint8]:
-        """Returns the road crop (size, size, 3) in RGB of `detail`, the working image reduced to the geometry's `detail_width`."""
+        """Returns the road crop (size, size, 3) in RGB of `detail`, a working image at the detail width."""
         factor = np.float32(detail.shape[1] / view.width)
         columns, rows = ((places + np.float32(0.5)) * factor - np.float32(0.5) for places in self.geometry.grid(view))
         crop = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -222,7 +220,9 @@ class RoadRegressor:
         seen = (output.presence >= self.threshold) & (output.sigma.mean(axis=1) <= _MOST_UNCERTAIN)
         sigma = output.sigma[seen, : len(_COMPARED)] * view.width / (_COMPARED * view.depth)
         sides = _sides(seen.tolist())
-        return EgoPrior(view, sides, output.curves(view).take(seen), np.hypot(sigma, _LEAST_SIGMA), output.presence[seen])
+        return EgoPrior(
+            view, sides, output.curves(view).take(seen), np.hypot(sigma, _LEAST_SIGMA), output.presence[seen]
+        )
 
 
 def _sides(seen: Sequence[bool]) -> tuple[int, ...]:

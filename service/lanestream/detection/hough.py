@@ -35,8 +35,8 @@ _PAD: Final = 3
 class HoughLines:
     """Lines of a working image, strongest first, one array entry per line.
 
-    A line is x(y) = `x_bottom` + `slope` (y - bottom row). `rising` is True if the image gets brighter from left to right
-    across it (the left edge of a bright marking). `votes` is the accumulator's weight.
+    A line is x(y) = `x_bottom` + `slope` (y - bottom row). `rising` is True if the image gets brighter from left to
+    right across it (the left edge of a bright marking). `votes` is the accumulator's weight.
     """
 
     x_bottom: NDArray[np.float64]
@@ -68,7 +68,7 @@ def hough_lines(edges: Edges, width: int, bottom: float) -> HoughLines:
 def _accumulate(
     x: NDArray[np.float32], y: NDArray[np.float32], angle: NDArray[np.float32], weight: NDArray[np.float32], reach: int
 ) -> NDArray[np.float32]:
-    """Returns the votes by rho, from -`reach` to `reach`, and theta, with `_PAD` columns of the other end at either end.
+    """Returns the votes by rho, from -`reach` to `reach`, and theta, padded by `_PAD` columns of the other end.
 
     `x` and `y`, and so rho, are in cells. A pixel at rho across and t along the line of its own direction is at
     rho cos d + t sin d across a line that is rotated by d.

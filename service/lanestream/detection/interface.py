@@ -26,9 +26,9 @@ Infer = Callable[[ModelRole, NDArray[np.uint8]], NDArray[np.float32]]
 class FrameContext:
     """What is known of a frame before it is looked at, in pixels of the working image.
 
-    `horizon` is its row, `tracked` are the boundaries of the last frame, and `prior_horizon` is the row that the ego-lane
-    prior of the last frame saw; each is None if unknown. The prior's row is the steadier one: boundaries on the road move
-    the other.
+    `horizon` is its row, `tracked` are the boundaries of the last frame, and `prior_horizon` is the row that the
+    ego-lane prior of the last frame saw; each is None if unknown. The prior's row is the steadier one: boundaries on
+    the road move the other.
     """
 
     horizon: float | None = None

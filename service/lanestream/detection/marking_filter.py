@@ -29,8 +29,8 @@ TOP_SHARE: Final = 0.08
 
 # Markings are about as wide as one of these.
 _WIDTHS: Final = (0.06, 0.12)
-# Contrast is relative to the road's own texture, which has about 1. A ridge has at least the first; none is more certain
-# than at the second.
+# Contrast is relative to the road's own texture, which has about 1. A ridge has at least the first; none is more
+# certain than at the second.
 _LEAST_CONTRAST: Final = 0.5
 _FULL_CONTRAST: Final = 3.0
 # Ridges of one row are at least this far apart.
@@ -57,15 +57,16 @@ class Ridges:
 def bar_contrast(image: NDArray[Any], widths: Sequence[int], gap: float = 0.0) -> NDArray[np.float32]:
     """Returns how much brighter a bar centered at each pixel is than the brighter of its two sides.
 
-    `image` is (R, C); bars and sides are one of the `widths` in pixels (odd), with `gap` widths between them. Of several
-    widths the highest contrast counts. Beyond the left and right border the last pixel repeats.
+    `image` is (R, C); bars and sides are one of the `widths` in pixels (odd), with `gap` widths between them. Of
+    several widths the highest contrast counts. Beyond the left and right border the last pixel repeats.
     """
     best: NDArray[np.float32] | None = None
     for width in widths:
         offset = width + int(gap * width)
         mean = cv2.boxFilter(image, cv2.CV_32F, (width, 1))
         padded = cv2.copyMakeBorder(mean, 0, 0, offset, offset, cv2.BORDER_REPLICATE)
-        contrast = mean - np.maximum(padded[:, : -2 * offset], padded[:, 2 * offset :])
+        sides = cv2.max(padded[:, : -2 * offset], padded[:, 2 * offset :])
+        contrast = np.asarray(cv2.subtract(mean, sides), np.float32)
         best = contrast if best is None else np.maximum(best, contrast, out=best)
     assert best is not None  # noqa: S101 - widths are never empty
     return best

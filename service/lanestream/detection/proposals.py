@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.interface import FrameContext
 from lanestream.detection.ego_prior import EgoPrior
 from lanestream.detection.features import find_edges
 from lanestream.detection.hough import hough_lines
+from lanestream.detection.interface import FrameContext
 from lanestream.detection.marking_filter import Ridges, find_ridges
 from lanestream.detection.vanishing_point import (
     KNOWN_HORIZON,
@@ -47,8 +47,8 @@ _HIGHEST_ROAD: Final = 0.42
 class Proposals:
     """The candidates of a frame, best first, in pixels of the working image.
 
-    All `curves` (N) share the horizon of `view` and are visible within `spans`. `horizon_weight` (0 to 1) is how much the
-    frame says about its horizon; `prior` is the ego-lane prior that guided the search, if any.
+    All `curves` (N) share the horizon of `view` and are visible within `spans`. `horizon_weight` (0 to 1) is how much
+    the frame says about its horizon; `prior` is the ego-lane prior that guided the search, if any.
     """
 
     curves: Curves
@@ -79,7 +79,8 @@ def propose(
     leading = [tracked]
     if prior is not None and prior.sides:
         own = prior.curves.below(point.y, view.bottom)
-        spacing = prior.spacing(point.places(own.x(np.array([view.bottom]))[:, 0], np.array([view.bottom])), _UNSPACED_SHARE)
+        bottom = np.array([view.bottom])
+        spacing = prior.spacing(point.places(own.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
         strength = strength * spacing.weight(lines.places)
         leading += [own, point.curves(spacing.neighbors)]
     order = np.argsort(-strength, kind="stable")
@@ -88,7 +89,7 @@ def propose(
     chosen = non_maximum_suppression(are_duplicates(ranked, ranked, view))
     first = chosen < sum(len(curves) for curves in leading)
     painted = (on_paint or Curves.none(point.y)).below(point.y, view.bottom)
-    painted = painted.take(~are_duplicates(painted, tracked, view).any(axis=1))
+    painted = painted.take(np.flatnonzero(~are_duplicates(painted, tracked, view).any(axis=1)))
     curves = Curves.concatenate([ranked.take(chosen[first]), painted, ranked.take(chosen[~first])])
     spans = visible_spans(curves, view)
     limit = min(limit, MOST_WITH_TRACKS) if len(tracked) else limit
@@ -96,9 +97,7 @@ def propose(
     return Proposals(curves.take(kept), spans.take(kept), view, point.weight, prior)
 
 
-def _find_vanishing_point(
-    gray: Image, context: FrameContext, prior: EgoPrior | None
-) -> tuple[VanishingPoint, Ridges]:
+def _find_vanishing_point(gray: Image, context: FrameContext, prior: EgoPrior | None) -> tuple[VanishingPoint, Ridges]:
     """Returns the vanishing point, near that of the prior or else found from edges, and the ridges of the road."""
     height, width = gray.shape
     if prior is not None and prior.sides:

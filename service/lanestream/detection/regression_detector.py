@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 
 from lanestream.detection.curve_fit import Fits, FitSettings, fit_curves
-from lanestream.detection.interface import Detections, FrameContext, Infer
 from lanestream.detection.ego_prior import REGRESSOR_ANCHORS, RegressorOutput, RoadRegressor
 from lanestream.detection.features import paint_gray
+from lanestream.detection.interface import Detections, FrameContext, Infer
 from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_spans
 

@@ -51,7 +51,7 @@ class VanishingPoint:
         return Curves(self.y, coefficients)
 
 
-# --- From Hough lines, if nothing else says where the road vanishes -----------------------------------------------------
+# --- From Hough lines, if nothing else says where the road vanishes -------------------------------------------------
 
 # A line supports a point with a Cauchy weight of its distance in these image widths.
 _TOLERANCE: Final = 0.012
@@ -118,7 +118,7 @@ def _least_squares_step(
     return x + float(np.clip(move[0], -limit, limit)), y + float(np.clip(move[1], -limit, limit))
 
 
-# --- Refined by the ridges ---------------------------------------------------------------------------------------------
+# --- Refined by the ridges ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def _sharpness(axes: FloatArray, ridges: Ridges, width: int, bottom: float) -> N
     return sharpness.reshape((axes.shape[1],) * 3)
 
 
-# --- Lines through it --------------------------------------------------------------------------------------------------
+# --- Lines through it -----------------------------------------------------------------------------------------------
 
 # A ridge votes for lines this near; two lines are at least so far apart. Both are lateral positions, as `b` is.
 _VOTE_WIDTH: Final = 0.08

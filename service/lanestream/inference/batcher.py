@@ -134,7 +134,7 @@ class Batcher:
     def submit(
         self, model: RunnableModel, inputs: NDArray[np.uint8], deadline: float | None = None
     ) -> Future[InferenceResult]:
-        """Returns the future result. It fails with ExpiredError if `deadline` (monotonic seconds) passes before the run.
+        """Returns the future result, which fails with ExpiredError if `deadline` (monotonic seconds) passes before.
 
         Raises RuntimeError after `close`.
         """

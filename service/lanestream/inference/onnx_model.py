@@ -14,10 +14,10 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from lanestream.errors import ModelError, ProviderError, one_line
+from lanestream.host import processors
 from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import ModelInfo, parse_info, require_file
 from lanestream.inference.providers import CPU, CUDA, DEFAULT_OPTIONS, ProviderSpec, RuntimeOptions
-from lanestream.host import processors
 
 # On the CPU a batch of any size costs the same per input, so nothing is padded. Beyond 8 inputs nothing is gained, and
 # memory is lost: onnxruntime keeps what its largest batch needed.

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.errors import ModelError, ProviderError, one_line
+from lanestream.host import processors
 from lanestream.inference.loaded_model import LoadedModel, Placement
 from lanestream.inference.model_info import METADATA_KEY, ModelInfo, parse_info, require_file
 from lanestream.inference.providers import DEFAULT_OPTIONS, OPENVINO, ProviderSpec, RuntimeOptions
-from lanestream.host import processors
 
 # A new batch size costs OpenVINO a few milliseconds once, and every size costs the same per input.
 _BATCH_SIZES: Final = tuple(range(1, 9))
@@ -98,8 +98,8 @@ def _properties(threads: int | None) -> Mapping[str, Any]:
     return {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": threads or processors(),
-        # By default it computes in bfloat16 if the CPU can, which costs more accuracy than an export may lose; quantized
-        # layers stay int8.
+        # By default it computes in bfloat16 if the CPU can, which costs more accuracy than an export may lose;
+        # quantized layers stay int8.
         "INFERENCE_PRECISION_HINT": "f32",
         # Threads pinned to processors block other processes that are pinned to the same ones.
         "ENABLE_CPU_PINNING": False,

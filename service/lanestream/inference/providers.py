@@ -67,9 +67,9 @@ class ProviderSpec:
     """One execution provider.
 
     `onnxruntime_name` is onnxruntime's name for it, empty for another runtime. `is_installed` and `auto_reason` look at
-    what is installed: the latter returns why `auto` takes the provider, or None if it does not. `missing` is the message
-    and the hint if it is not installed. `module` has a function `load(path, spec, options, reason)`. `options` returns
-    onnxruntime's options for the provider.
+    what is installed: the latter returns why `auto` takes the provider, or None if it does not. `missing` is the
+    message and the hint if it is not installed. `module` has a function `load(path, spec, options, reason)`. `options`
+    returns onnxruntime's options for the provider.
     """
 
     name: str

@@ -20,11 +20,12 @@ class Camera:
         return width / (2.0 * math.tan(math.radians(self.field_of_view) / 2.0))
 
     def ground(self, curve: Curve, width: int) -> tuple[float, float, float]:
-        """Returns the curve on the road: (a, b, c) of Y = a X^2 + b X + c in meters, X forward and Y left of the camera.
+        """Returns the curve on the road, (a, b, c) of Y = a X^2 + b X + c in meters, X forward, Y left of the camera.
 
         `curve` is in pixels of an image `width` pixels wide, whose middle column cx looks straight ahead. With the
         focal length f, similar triangles put a point u rows below the horizon at X = f height / u, and a point x - cx
-        columns to the right of the middle at Y = -(x - cx) height / u. With x = v + b u + k / u and 1 / u = X / (f height),
+        columns to the right of the middle at Y = -(x - cx) height / u. With x = v + b u + k / u and
+        1 / u = X / (f height),
 
             Y = -k / (f^2 height) X^2 - (v - cx) / f X - b height.
 

@@ -61,7 +61,9 @@ class RoadCropGeometry:
 
     def __post_init__(self) -> None:
         if min(self.size, self.detail_width) < 1 or self.above < 0.0 or not 0.0 < self.narrowest <= 1.0:
-            raise ValueError("size and detail_width must be positive, above at least 0, narrowest above 0 and at most 1")
+            raise ValueError(
+                "size and detail_width must be positive, above at least 0, narrowest above 0 and at most 1"
+            )
 
     def grid(self, view: RoadView) -> tuple[FloatMap, FloatMap]:
         """Returns the image columns and rows, each (size, size), at which the pixels of the crop are sampled."""

@@ -18,7 +18,7 @@ from lanestream.streaming.store import SessionStore, StoredSession
 
 if TYPE_CHECKING:
     from lanestream.protocol import DetectorName, StartMessage
-    from lanestream.workers.pool import Camera, WorkerPool
+    from lanestream.workers.pool import SessionHandle, WorkerPool
 
 _log = logging.getLogger(__name__)
 
@@ -62,12 +62,12 @@ class SessionLimits:
 class OpenSession:
     """A session in use by a socket or a single image: its name, its camera state and the caller it belongs to.
 
-    `token` resumes it; None if the client was given none. `last_seq` is the last answered frame. The state of `camera`
+    `token` resumes it; None if the client was given none. `last_seq` is the last answered frame. The state of `handle`
     may be read only while `processing` is False. `resume_outcome` is None unless the client asked to resume a session.
     """
 
     id: str
-    camera: Camera
+    handle: SessionHandle
     caller: Caller
     born: float
     token: str | None = None
@@ -147,8 +147,8 @@ class SessionRegistry:
         Raises BusyError at a limit, and NoDetectorError if `detector` is not loaded.
         """
         self.check_limits(caller)
-        camera = pool.open_camera(horizon, detector)
-        session = OpenSession(name or secrets.token_hex(8), camera, caller, self._wall_clock())
+        handle = pool.open_session(horizon, detector)
+        session = OpenSession(name or secrets.token_hex(8), handle, caller, self._wall_clock())
         self._open.add(session)
         return session
 
@@ -236,7 +236,7 @@ class SessionRegistry:
     def _restore(self, session: OpenSession, record: SessionRecord) -> bool:
         """Puts the state of `record` into `session`. Returns False if the state can't be used."""
         try:
-            session.camera.restore(record.state, 0 if record.clean else _UNSAVED_IDS)
+            session.handle.restore(record.state, 0 if record.clean else _UNSAVED_IDS)
         except ValueError:
             _log.warning("the saved state of session %s can't be used; it starts over", record.session)
             return False
@@ -252,7 +252,7 @@ class SessionRegistry:
             stream_s=session.stream_s,
             last_seq=session.last_seq,
             clean=clean,
-            state=session.camera.state,
+            state=session.handle.state,
         )
 
     def _save_timer_fired(self, session: OpenSession) -> None:

@@ -16,12 +16,12 @@ GATE: Final = 14.2
 
 
 def associate(tracks: Sequence[Track], columns: FloatArray, noise: FloatArray) -> list[tuple[int, int]]:
-    """Returns (track, detection) index pairs for detections with the `columns` (M, 3) and covariances `noise` (M, 3, 3).
+    """Returns (track, detection) index pairs; detections have `columns` (M, 3) and covariances `noise` (M, 3, 3).
 
-    The cost of a pair is the innovation's negative log likelihood d^2 + ln det S; pairs outside the gate are impossible.
-    Boundaries do not cross at the bottom row, so tracks and detections are matched in order from left to right: the most
-    pairs that keep the order, and of those the cheapest. That is an alignment of two sequences, found by dynamic
-    programming (S. Needleman and C. Wunsch, 1970).
+    The cost of a pair is the innovation's negative log likelihood d^2 + ln det S; pairs outside the gate are
+    impossible. Boundaries do not cross at the bottom row, so tracks and detections are matched in order from left to
+    right: the most pairs that keep the order, and of those the cheapest. That is an alignment of two sequences, found
+    by dynamic programming (S. Needleman and C. Wunsch, 1970).
     """
     if not tracks or not len(columns):
         return []
@@ -65,7 +65,7 @@ def _cheapest_alignment(costs: list[list[float]]) -> list[tuple[int, int]]:
 def recover(
     tracks: Sequence[Track], columns: FloatArray, pairs: Sequence[tuple[int, int]], reach: FloatArray
 ) -> list[tuple[int, int]]:
-    """Returns further (track, detection) pairs: confirmed tracks without one, and detections within `reach` (3,) of them.
+    """Returns further (track, detection) pairs: confirmed tracks without one, with detections within `reach` (3,).
 
     A road that turns faster than the filter expects takes its detections out of the track's gate. If they are still
     nearest to that track in the second frame, they are the same boundary and the filter was wrong; a single one outside

@@ -60,9 +60,7 @@ class TrackedRows:
         return np.asarray(curve_basis(self.horizon, other.y) @ self._to_coefficients)
 
 
-def initial_state(
-    columns: FloatArray, covariance: FloatArray, speed: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def initial_state(columns: FloatArray, covariance: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Returns the state (6,) and covariance (6, 6) of a new boundary.
 
     It is at `columns` (3,) with their `covariance` (3, 3), at rest within `speed` (3,) pixels per second.
@@ -109,9 +107,10 @@ def update(
 def innovation_distances(
     columns: FloatArray, covariances: FloatArray, measured: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns the squared Mahalanobis distances and log determinants (N, M) of N tracks' innovations for M measurements.
+    """Returns squared Mahalanobis distances and log determinants (N, M) of N tracks' innovations for M measurements.
 
-    `columns` (N, 3) and `covariances` (N, 3, 3) are the tracks', `measured` (M, 3) and `noise` (M, 3, 3) the detections'.
+    `columns` (N, 3) and `covariances` (N, 3, 3) are the tracks', `measured` (M, 3) and `noise` (M, 3, 3) the
+    detections'.
     """
     innovation = covariances[:, None] + noise
     residual = measured - columns[:, None]

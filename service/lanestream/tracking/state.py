@@ -53,7 +53,7 @@ class TrackSnapshot:
         )
 
     def track(self, memory: int) -> Track:
-        """Returns the track, which remembers the hits of `memory` frames. Raises ValueError for an incomplete filter."""
+        """Returns the track, which remembers the hits of `memory` frames. Raises ValueError for half a filter."""
         numbers = np.frombuffer(b64decode(self.filter, validate=True), _NUMBERS).astype(float)
         return Track(
             numbers[:STATE].copy(),

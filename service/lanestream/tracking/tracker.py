@@ -258,9 +258,7 @@ class LaneTracker:
         if not tracks:
             return FrameResult((), EgoLane(), view.horizon)
         curves = rows.curves(np.stack([track.columns for track in tracks]))
-        covariances = rows.covariances_of_curves(
-            np.stack([track.covariance[:MEASURED, :MEASURED] for track in tracks])
-        )
+        covariances = rows.covariances_of_curves(np.stack([track.covariance[:MEASURED, :MEASURED] for track in tracks]))
         columns = curves.x(np.array([view.bottom]))[:, 0].tolist()
         lane_width = self._lane_width * view.depth
         changes = [lane_change(track, x, view.middle, lane_width) for track, x in zip(tracks, columns, strict=True)]

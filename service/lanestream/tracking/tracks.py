@@ -15,9 +15,9 @@ class Track:
     """A tracked boundary. Times are seconds on the tracker's own clock.
 
     `state` (6,) and `covariance` (6, 6) are the filter's. `hits` remembers for the last frames whether a detection
-    supported it. `side` is -1 left and +1 right of the camera; `crossing` counts the frames in which it has been clearly
-    on the other one. `drift` is how much the road has turned under it since it was last detected. `previous_columns` are
-    those of the last frame.
+    supported it. `side` is -1 left and +1 right of the camera; `crossing` counts the frames in which it has been
+    clearly on the other one. `drift` is how much the road has turned under it since it was last detected.
+    `previous_columns` are those of the last frame.
     """
 
     state: FloatArray

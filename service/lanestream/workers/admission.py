@@ -18,8 +18,8 @@ class _Waiter:
 class FairSemaphore:
     """Admits frames to `slots`, first come, first served; at most `latest_slots` of them for frames of mode `latest`.
 
-    A frame of mode `latest` that has to leave the slots to others keeps its place in the queue: if cameras of both modes
-    wait, none waits for longer than the others' frames take. Belongs to one event loop.
+    A frame of mode `latest` that has to leave the slots to others keeps its place in the queue: if cameras of both
+    modes wait, none waits for longer than the others' frames take. Belongs to one event loop.
     """
 
     def __init__(self, slots: int, latest_slots: int) -> None:

@@ -28,9 +28,7 @@ class ModelSummary:
     def of(cls, model: LoadedModel) -> ModelSummary:
         """Returns the summary of `model`."""
         placement = model.placement
-        return cls(
-            model.name, placement.provider, placement.reason, placement.fell_back, model.sha256, model.metadata
-        )
+        return cls(model.name, placement.provider, placement.reason, placement.fell_back, model.sha256, model.metadata)
 
 
 @dataclass(frozen=True)

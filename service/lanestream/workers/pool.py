@@ -35,8 +35,8 @@ class SessionHandle(Protocol):
 class WorkerPool(ABC):
     """Processes encoded frames; the frames of one session one at a time, those of different ones in parallel.
 
-    Frames wait for admission before anything is spent on them, so however many there are, a frame that was begun is soon
-    done. `workers` processes have `threads_each`; `own_threads` of this process are for other work.
+    Frames wait for admission before anything is spent on them, so however many there are, a frame that was begun is
+    soon done. `workers` processes have `threads_each`; `own_threads` of this process are for other work.
     """
 
     def __init__(self, capabilities: Capabilities, workers: int, threads_each: int, own_threads: int) -> None:

@@ -13,9 +13,8 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import LanestreamError, WorkerLostError
+from lanestream.host import memory_limit, processors
 from lanestream.inference.providers import PROVIDERS
-from lanestream.host import memory_limit
-from lanestream.host import processors
 from lanestream.session import SessionState
 from lanestream.tracking.tracker import LaneTracker
 from lanestream.workers.capabilities import Capabilities
@@ -115,8 +114,8 @@ class Worker:
     async def process(self, session: RemoteSession, frame: EncodedFrame, limit_s: float) -> FrameDone:
         """Returns the outcome of a frame.
 
-        Raises WorkerLostError if the worker ends before, TimeoutError if the frame takes `limit_s` seconds. Time in which
-        the service itself was suspended, with its container for example, hardly counts: so was the worker.
+        Raises WorkerLostError if the worker ends before, TimeoutError if the frame takes `limit_s` seconds. Time in
+        which the service itself was suspended, with its container for example, hardly counts: so was the worker.
         """
         number = next(self._numbers)
         done: asyncio.Future[FrameDone] = asyncio.get_running_loop().create_future()
@@ -212,14 +211,14 @@ class ProcessPool(WorkerPool):
         cls,
         setup: WorkerSetup,
         processes: int | None = None,
-        threads_per_process: Callable[[int], int] | None = None,
+        threads_of: Callable[[int], int] | None = None,
         observe: Callable[[BatchReport], None] | None = None,
         frame_s: float = _FRAME_S,
     ) -> ProcessPool:
-        """Returns a pool with warm workers: `threads_per_process` returns the threads of each of so many `processes`, default 1.
+        """Returns a pool with warm workers: `threads_of` returns the threads of each of so many `processes`, default 1.
 
-        By default networks on the CPU get a process for each processor, up to 8 and to what a container's memory has room
-        for; those on a device get one for all, in which the requests of all cameras meet. Raises what `setup.load`
+        By default networks on the CPU get a process for each processor, up to 8 and to what a container's memory has
+        room for; those on a device get one for all, in which the requests of all cameras meet. Raises what `setup.load`
         raises.
         """
         workers = [await Worker.start(setup)]
@@ -232,7 +231,7 @@ class ProcessPool(WorkerPool):
             for worker in workers:
                 await worker.kill()
             raise error.exceptions[0] if isinstance(error, ExceptionGroup) else error from None
-        return cls(setup, workers, threads_per_process(processes) if threads_per_process is not None else 1, observe, frame_s)
+        return cls(setup, workers, threads_of(processes) if threads_of is not None else 1, observe, frame_s)
 
     @property
     def works(self) -> bool:

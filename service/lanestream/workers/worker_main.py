@@ -1,7 +1,7 @@
 """The program of a worker process: frames in, lanes out, over the socket that the service started it with.
 
-It holds the networks and nothing else: the session's state comes with each frame and goes back with its lanes. Hence any
-worker can take any frame, and one that ends loses only the frames that it was processing.
+It holds the networks and nothing else: the session's state comes with each frame and goes back with its lanes. Hence
+any worker can take any frame, and one that ends loses only the frames that it was processing.
 """
 
 from __future__ import annotations

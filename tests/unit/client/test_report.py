@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from lanestream.protocol import EgoModel, LanesMessage, TimingModel
 from lanestream_client.report import Tally, percentile
 from lanestream_client.service import ServiceInfo
+
+from lanestream.protocol import EgoModel, LanesMessage, TimingModel
 
 
 def test_the_report_counts_and_measures() -> None:

@@ -88,7 +88,7 @@ def resolve(reference: str) -> Any:
 
 
 def payload_validator(name: str) -> jsonschema_rs.Draft7Validator:
-    """Returns a validator for messages of a type, which can resolve all json_schemas of the document."""
+    """Returns a validator for messages of a type, which can resolve all schemas of the document."""
     payload = document()["components"]["messages"][name]["payload"]
     return jsonschema_rs.Draft7Validator({**payload, "components": document()["components"]})
 
@@ -153,7 +153,7 @@ def test_the_json_schemas_name_all_messages() -> None:
 
 
 def test_the_schemas_use_the_dialect_that_asyncapi_requires() -> None:
-    for schema in document()["components"]["json_schemas"].values():
+    for schema in document()["components"]["schemas"].values():
         jsonschema_rs.meta.validate({**schema, "$schema": "http://json-schema.org/draft-07/schema#"})
     newer = {"prefixItems", "$defs", "dependentRequired", "unevaluatedProperties"}
     assert not [each for each in objects(document()) if newer & each.keys()]

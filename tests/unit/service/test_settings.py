@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lanestream.processors import processors
 from pydantic_core import PydanticUndefined
 
 from lanestream.errors import SettingsError
 from lanestream.keys import ApiKey
-from lanestream.processors import processors
 from lanestream.settings import Settings, load_settings, to_toml
 
 OPERATIONS = Path(__file__).parents[3] / "docs" / "operations.md"
