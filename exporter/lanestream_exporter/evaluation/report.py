@@ -154,7 +154,7 @@ def _chart(caption: str, draw: Callable[[Axes], None]) -> Chart:
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     # The charts share a page, so their ids must not collide.
     prefix = re.sub(r"\W+", "-", caption) + "-"
-    svg = re.sub(r'(id="|href="#|url\(#)', lambda found: found.group(1) + prefix, buffer.getvalue())
+    svg = re.sub(r'(id="|href="#|url\(#)', lambda match: match.group(1) + prefix, buffer.getvalue())
     return Chart(caption, svg[svg.index("<svg") :])
 
 

@@ -30,7 +30,7 @@ class BoundaryCounts:
         self.right += len(frame.matches)
         self.wrong += frame.wrong
         self.missed += frame.missed
-        self.errors += [match.error for match in frame.matches]
+        self.errors += [boundary.error for boundary in frame.matches]
 
     @property
     def precision(self) -> float:

@@ -124,7 +124,7 @@ def export_network(
         for path in files.values():
             describe(path, network.info(ExportDescription(settings.name, settings.precision, training, {})))
         progress("verifying")
-        report = _measure(original, network, validation, files)
+        report = _measure(original, network, validation, files, settings.precision)
         _check_tolerance(report, settings)
         metrics = _metadata_metrics(report, frames)
         finished = files[settings.precision]
@@ -148,17 +148,22 @@ def _write_files(
 
 
 def _measure(
-    original: ExportableNetwork, network: ExportableNetwork, validation: ValidationSet, files: dict[Precision, Path]
+    original: ExportableNetwork,
+    network: ExportableNetwork,
+    validation: ValidationSet,
+    files: dict[Precision, Path],
+    precision: Precision,
 ) -> ExportReport:
     expected = in_batches(network.serving_module(), validation.inputs).numpy()
     # The uncompressed checkpoint gets the same temperature and threshold, which belong to the file.
     checkpoint = original.with_calibration(network.calibration).serving_module()
     checkpoint_metrics = network.metrics(in_batches(checkpoint, validation.inputs).numpy(), validation)
     times = time_files({str(name): path for name, path in files.items()}, validation.inputs)
-    measured: dict[str, ModelMeasurement] = {}
+    outputs: dict[Precision, NDArray[np.float32]] = {}
+    measured: dict[Precision, ModelMeasurement] = {}
     for name, path in files.items():
-        outputs, mean, largest = differences(OnnxModel.load(path, "cpu"), validation, expected)
-        metrics = network.metrics(outputs, validation)
+        outputs[name], mean, largest = differences(OnnxModel.load(path, "cpu"), validation, expected)
+        metrics = network.metrics(outputs[name], validation)
         size, milliseconds = path.stat().st_size, times.milliseconds[name]
         measured[name] = ModelMeasurement(name, metrics, mean, largest, size, milliseconds)
     return ExportReport(
@@ -167,8 +172,8 @@ def _measure(
         len(validation.inputs),
         ModelMeasurement("checkpoint", checkpoint_metrics),
         measured["fp32"],
-        measured[name],  # the loop ends with the written file
-        compare_boundaries(network.detector, validation, expected, outputs),
+        measured[precision],
+        compare_boundaries(network.detector, validation, expected, outputs[precision]),
         times.provider,
     )
 

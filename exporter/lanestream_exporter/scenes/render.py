@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SOURCE = "rendered"
 MAX_LABEL_DISTANCE = 120.0  # meters; people do not label boundaries farther away
 MIN_LANE_WIDTH = 12.0  # pixels of a 640 pixel wide image; the boundaries of narrower lanes merge
-USUAL_LANE = 3.5  # meters
+TYPICAL_LANE_WIDTH = 3.5  # meters
 LABEL_ROWS = 90  # approximate number of rows with label points over the image height
 MIN_LABEL_SPAN = 0.05  # share of the image height that a label must span
 
@@ -131,7 +131,7 @@ def _rows(scene: Scene, projection: RoadProjection) -> FloatArray:
     step = max(1, camera.height // LABEL_ROWS)
     rows = np.arange(camera.height - 1, -1, -step, dtype=np.float64)
     distance = camera.road_distance(rows, projection.vertical_curvature)
-    max_distance = camera.focal * USUAL_LANE / (MIN_LANE_WIDTH * camera.width / 640.0)
+    max_distance = camera.focal * TYPICAL_LANE_WIDTH / (MIN_LANE_WIDTH * camera.width / 640.0)
     return rows[distance < min(MAX_LABEL_DISTANCE, max_distance, projection.reach, visibility(scene))]
 
 

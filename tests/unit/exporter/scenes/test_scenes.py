@@ -110,7 +110,7 @@ def test_an_unmarked_road_edge_is_labeled_as_edge(plain: Scene) -> None:
     assert (edge.kind, edge.color, edge.position) == ("edge", None, 1)
 
 
-def test_labels_stay_above_the_bonnet(plain: Scene) -> None:
+def test_labels_stay_above_the_hood(plain: Scene) -> None:
     hood = Hood(height=0.15, droop=0.0, color=(0.1, 0.1, 0.1), shine=0.0)
     lanes = render_still(replace(plain, lens=Lens(hood=hood))).labels.lanes
     assert max(lane.points[:, 1].max() for lane in lanes) < 0.85 * 360
