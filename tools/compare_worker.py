@@ -44,16 +44,17 @@ def main(cpu: int) -> None:
         wall, used = time.perf_counter(), time.process_time()
         message = camera.lanes(image, seq=request["seq"], timestamp=request["timestamp"])
         used, wall = time.process_time() - used, time.perf_counter() - wall
-        # The monotonic clock is the same in all processes of the machine.
         reply: dict[str, object] = {
+            "package": lanestream.__file__,
+            # The monotonic clock is the same in all processes of the machine.
             "answered": time.monotonic(),
             "cpu_s": used,
             "wall_s": wall,
+            "process_cpu_s": time.process_time(),
             "peak_rss_mb": peak_rss_mb(),
         }
         if request.get("answer"):
             reply["answer"] = message.model_dump(mode="json", include={"width", "lanes"})
-        reply["package"] = lanestream.__file__
         replies.write(json.dumps(reply) + "\n")
         replies.flush()
 

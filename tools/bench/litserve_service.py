@@ -58,19 +58,19 @@ def run_batched(frames: Sequence[Steps[FrameResult]]) -> list[FrameResult]:
     """Returns the results of all frames. Their inputs for the same network are run as one batch."""
     whole = [in_one(steps) for steps in frames]
     results: dict[int, FrameResult] = {}
-    asked: dict[int, Question] = {}
+    pending: dict[int, Question] = {}
 
     def go(index: int, answer: Any) -> None:
         try:
-            asked[index] = whole[index].send(answer)
+            pending[index] = whole[index].send(answer)
         except StopIteration as end:
             results[index] = end.value
 
     for index in range(len(frames)):
         go(index, None)
-    while asked:
-        network = next(iter(asked.values())).network
-        together = {i: asked.pop(i) for i in list(asked) if asked[i].network is network}
+    while pending:
+        network = next(iter(pending.values())).network
+        together = {i: pending.pop(i) for i in list(pending) if pending[i].network is network}
         outputs = network.run(np.concatenate([question.inputs for question in together.values()]))
         ends = np.cumsum([len(question.inputs) for question in together.values()])
         for index, answer in zip(together, np.split(outputs, ends[:-1]), strict=True):

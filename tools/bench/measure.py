@@ -1,4 +1,4 @@
-"""Measures workloads one after the other: one runner runs, all others are stopped meanwhile."""
+"""Measures workloads one after the other: while one runner runs, all others are stopped."""
 
 from __future__ import annotations
 
