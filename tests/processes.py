@@ -1,4 +1,4 @@
-"""Services in processes of their own, which can be stopped and killed."""
+"""Services in separate processes, which can be stopped and killed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def service(**settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A service in a process of its own, ready, and its URL."""
+    """Runs a service in a separate process and yields the process and its URL once it is ready."""
     environment = {f"LANESTREAM_{name.upper()}": str(value) for name, value in settings.items()}
     command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
     with subprocess.Popen(

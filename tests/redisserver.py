@@ -1,4 +1,4 @@
-"""A real Redis on a free port, for those who have `redis-server`."""
+"""A real Redis server on a free port; needs `redis-server`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 @contextmanager
 def redis_server(folder: Path) -> Iterator[str]:
-    """The URL of a Redis that keeps nothing on disk."""
+    """Runs a Redis without persistence and yields its URL."""
     program = shutil.which("redis-server")
     if program is None:
         pytest.fail("redis-server is not installed (on Debian: apt install redis-server)")
@@ -33,11 +33,11 @@ def redis_server(folder: Path) -> Iterator[str]:
 
 
 def _wait_for(port: int) -> None:
-    ends = time.monotonic() + fakes.WAIT_S
-    while time.monotonic() < ends:
-        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as there:
-            there.sendall(b"PING\r\n")
-            if there.recv(16).startswith(b"+PONG"):
+    deadline = time.monotonic() + fakes.WAIT_S
+    while time.monotonic() < deadline:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as connection:
+            connection.sendall(b"PING\r\n")
+            if connection.recv(16).startswith(b"+PONG"):
                 return
         time.sleep(0.01)
     pytest.fail("redis-server did not start")

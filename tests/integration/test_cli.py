@@ -315,7 +315,7 @@ def test_a_password_is_not_told_where_the_url_is_none(run: Run, monkeypatch: pyt
 def test_a_name_of_a_key_that_can_not_be_is_told(run: Run) -> None:
     code, output, errors = run("key", "camera 7")
     assert (code, output) == (1, "")
-    assert errors.startswith("error: 'camera 7' can't be the name of a key (")
+    assert errors.startswith("error: 'camera 7' is not a valid name for a key (")
 
 
 @pytest.mark.parametrize("option", ["--model", "--regressor"])

@@ -151,9 +151,9 @@ class Metrics:
         """Counts an error sent to a client."""
         self._refusals.labels(code).inc()
 
-    def loaded(self, offer: Offer) -> None:
+    def loaded(self, info: Offer) -> None:
         """Reports a detector that is ready, and its network."""
-        network = offer.network
+        network = info.network
         device = "gpu" if network.provider in _ON_GPU else "cpu"
         metadata = network.metadata
         self._provider.labels(network.name, network.provider, device, metadata.get("precision", "unknown")).set(1)

@@ -68,8 +68,8 @@ class Service:
 
     def install(self, pool: WorkerPool) -> None:
         """Makes the service ready with a warm worker pool."""
-        for detector in pool.offers.all:
-            self.metrics.loaded(detector)
+        for info in pool.offers.all:
+            self.metrics.loaded(info)
         self.metrics.workers(lambda: pool.pids)
         self._pool = pool
 
