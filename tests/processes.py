@@ -1,4 +1,4 @@
-"""Services in processes of their own, which tests can stop and kill."""
+"""Services in separate processes, which can be stopped and killed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def service(**settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Starts a service in a process of its own and yields the process and the URL when it is ready."""
+    """Runs a service in a separate process and yields the process and its URL once it is ready."""
     environment = {f"LANESTREAM_{name.upper()}": str(value) for name, value in settings.items()}
     command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
     with subprocess.Popen(

@@ -266,7 +266,7 @@ def needs_extra(extra: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"this feature needs the package {error.name}, which is not installed",
+            f"this needs the package {error.name}, which is not installed",
             f"pip install 'lanestream[{extra}]'",
         ) from None
 

@@ -98,7 +98,7 @@ def _lane(lane: LaneBoundary, points: list[Point], ground: GroundCurve | None) -
 
 
 def _rounded(values: GroundCurve, decimals: tuple[int, int, int]) -> GroundCurve:
-    a, b, c = (round(value, places) for value, places in zip(values, decimals, strict=True))
+    a, b, c = (round(value, digits) for value, digits in zip(values, decimals, strict=True))
     return a, b, c
 
 

@@ -1,4 +1,4 @@
-"""Who may come in, over real sockets: keys, origins, and what stays open."""
+"""Access over real sockets: keys, origins, and public routes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ import fakes
 import httpx
 import pytest
 from fastapi.routing import APIRoute
-from talking import all_released
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from wsclient import wait_until_released
 
 from lanestream.api import create_app
 from lanestream.api.auth import Authenticator, warn_if_open
@@ -31,12 +31,12 @@ TOKEN, KEY = new_key("camera-7")
 OTHER_TOKEN, OTHER_KEY = new_key("camera-8")
 FOREIGN = "https://evil.example"
 LISTED = "https://lanes.example.com"
-OPEN_PATHS = {"/healthz", "/readyz", "/v1/schema", "/v1/asyncapi.json"}
+PUBLIC_PATHS = {"/healthz", "/readyz", "/v1/schema", "/v1/asyncapi.json"}
 
 
 @pytest.fixture
 def guarded(serve: Serve) -> str:
-    """A service that asks for one of two keys."""
+    """Returns the URL of a service that requires one of two keys."""
     return serve(fakes.engine(), api_keys=f"{KEY},{OTHER_KEY}", allowed_origins=LISTED)
 
 
@@ -44,40 +44,40 @@ def bearer(token: str, scheme: str = "Bearer") -> dict[str, str]:
     return {"authorization": f"{scheme} {token}"}
 
 
-def shaken(url: str, **how: Any) -> str | None:
-    """The subprotocol that was agreed on, after a frame was answered. Raises InvalidStatus where we were refused."""
-    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None, **how) as socket:
+def send_frame(url: str, **options: Any) -> str | None:
+    """Streams a frame and returns the selected subprotocol. Raises InvalidStatus if the handshake is refused."""
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None, **options) as socket:
         socket.send(fakes.image_file())
         assert json.loads(socket.recv(fakes.WAIT_S))["type"] == "lanes"
         return socket.subprotocol
 
 
-def refused(url: str, **how: Any) -> tuple[int, str, str | None]:
-    """Status, code and challenge of a handshake that was refused."""
+def refused_handshake(url: str, **options: Any) -> tuple[int, str, str | None]:
+    """Returns the status, code and challenge of a handshake that is refused."""
     with pytest.raises(InvalidStatus) as caught:
-        shaken(url, **how)
+        send_frame(url, **options)
     response = caught.value.response
-    told = json.loads(response.body)
-    assert set(told) == {"code", "message", "hint"}
-    return response.status_code, told["code"], response.headers.get("www-authenticate")
+    problem = json.loads(response.body)
+    assert set(problem) == {"code", "message", "hint"}
+    return response.status_code, problem["code"], response.headers.get("www-authenticate")
 
 
 @pytest.mark.parametrize("token", [TOKEN, OTHER_TOKEN], ids=["one", "other"])
-def test_a_key_opens_requests_and_streams(guarded: str, token: str) -> None:
+def test_a_key_grants_access_to_requests_and_streams(guarded: str, token: str) -> None:
     for headers in (bearer(token), bearer(token, "bearer"), bearer(f" {token}")):
         assert httpx.post(f"{guarded}/v1/detect", content=fakes.image_file(), headers=headers).status_code == 200
-        assert shaken(guarded, additional_headers=headers) is None
-        assert shaken(guarded, additional_headers=headers, subprotocols=["lanestream.v1"]) == "lanestream.v1"
+        assert send_frame(guarded, additional_headers=headers) is None
+        assert send_frame(guarded, additional_headers=headers, subprotocols=["lanestream.v1"]) == "lanestream.v1"
 
 
-def test_a_browser_offers_the_key_as_a_subprotocol_and_never_gets_it_back(guarded: str) -> None:
+def test_a_key_offered_as_a_subprotocol_is_never_selected(guarded: str) -> None:
     key = f"bearer.{TOKEN}"
-    assert shaken(guarded, subprotocols=["lanestream.v1", key]) == "lanestream.v1"
-    assert shaken(guarded, subprotocols=[key, "lanestream.v1"]) == "lanestream.v1"
-    assert shaken(guarded, subprotocols=[key]) is None
+    assert send_frame(guarded, subprotocols=["lanestream.v1", key]) == "lanestream.v1"
+    assert send_frame(guarded, subprotocols=[key, "lanestream.v1"]) == "lanestream.v1"
+    assert send_frame(guarded, subprotocols=[key]) is None
 
 
-WRONG = [
+WRONG_HEADERS = [
     {},
     {"authorization": "Bearer"},
     {"authorization": TOKEN},
@@ -89,42 +89,42 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize("headers", WRONG, ids=range(len(WRONG)))
-def test_without_a_right_key_nobody_comes_in(guarded: str, headers: dict[str, str]) -> None:
+@pytest.mark.parametrize("headers", WRONG_HEADERS, ids=range(len(WRONG_HEADERS)))
+def test_requests_and_streams_without_a_valid_key_are_refused(guarded: str, headers: dict[str, str]) -> None:
     response = httpx.post(f"{guarded}/v1/detect?key={TOKEN}&horizon=9", content=b"no image", headers=headers)
     assert (response.status_code, response.json()["code"]) == (401, "unauthorized")
     assert response.headers["www-authenticate"] == "Bearer"
-    assert refused(guarded, additional_headers=headers) == (401, "unauthorized", "Bearer")
+    assert refused_handshake(guarded, additional_headers=headers) == (401, "unauthorized", "Bearer")
 
 
 @pytest.mark.parametrize(
     "offered", ["bearer.", f"bearer.{TOKEN}x", TOKEN, f"Bearer.{TOKEN}"], ids=["empty", "longer", "bare", "upper case"]
 )
-def test_a_wrong_subprotocol_is_no_key(guarded: str, offered: str) -> None:
-    assert refused(guarded, subprotocols=["lanestream.v1", offered])[:2] == (401, "unauthorized")
+def test_an_invalid_subprotocol_is_not_a_key(guarded: str, offered: str) -> None:
+    assert refused_handshake(guarded, subprotocols=["lanestream.v1", offered])[:2] == (401, "unauthorized")
 
 
-def test_a_wrong_header_is_not_made_good_by_a_subprotocol(guarded: str) -> None:
-    assert refused(guarded, additional_headers=bearer("x"), subprotocols=[f"bearer.{TOKEN}"])[0] == 401
+def test_a_subprotocol_does_not_replace_a_wrong_header(guarded: str) -> None:
+    assert refused_handshake(guarded, additional_headers=bearer("x"), subprotocols=[f"bearer.{TOKEN}"])[0] == 401
 
 
-def test_every_route_is_guarded_but_those_for_everybody() -> None:
+def test_every_route_is_guarded_except_public_ones() -> None:
     app = create_app(fakes.engine(), Settings(api_keys=str(KEY)))
-    described = app.openapi()
-    assert described["components"]["securitySchemes"]["HTTPBearer"]["scheme"] == "bearer"
-    guarded = {path for path, told in described["paths"].items() if all("security" in each for each in told.values())}
-    assert set(described["paths"]) - guarded == OPEN_PATHS
+    schema = app.openapi()
+    assert schema["components"]["securitySchemes"]["HTTPBearer"]["scheme"] == "bearer"
+    guarded = {path for path, item in schema["paths"].items() if all("security" in method for method in item.values())}
+    assert set(schema["paths"]) - guarded == PUBLIC_PATHS
     assert {"/v1/detect", "/v1/models", "/metrics"} <= guarded
     assert all(isinstance(route, APIRoute) for route in app.routes if getattr(route, "path", "") in guarded)
     without_keys = create_app(fakes.engine(), Settings()).openapi()
     assert "securitySchemes" not in without_keys["components"]
 
 
-def test_what_is_described_as_guarded_is(guarded: str) -> None:
+def test_documented_guards_are_enforced(guarded: str) -> None:
     for path, methods in httpx.get(f"{guarded}/openapi.json").json()["paths"].items():
         for method in methods:
             status = httpx.request(method, f"{guarded}{path}").status_code
-            assert (status == 200) == (path in OPEN_PATHS), path
+            assert (status == 200) == (path in PUBLIC_PATHS), path
             assert status in (200, 401), path
     assert httpx.get(f"{guarded}/docs").status_code == 200
 
@@ -132,7 +132,7 @@ def test_what_is_described_as_guarded_is(guarded: str) -> None:
 @pytest.mark.parametrize(
     "path", ["/v1/models/", "//v1/models", "/v1/./models", "/v1%2fmodels", "/healthz/../v1/models"]
 )
-def test_no_spelling_of_a_path_slips_past(guarded: str, path: str) -> None:
+def test_no_spelling_of_a_path_evades_the_guard(guarded: str, path: str) -> None:
     port = int(guarded.rpartition(":")[2])
     with httpx.Client() as client:
         for host in (f"127.0.0.1:{port}", "x/healthz?", "x/healthz#"):
@@ -145,7 +145,7 @@ def test_no_spelling_of_a_path_slips_past(guarded: str, path: str) -> None:
 def test_a_page_of_a_foreign_origin_is_refused_before_the_handshake(serve: Serve, keys: str | None) -> None:
     url = serve(fakes.engine(), allowed_origins=LISTED, **({"api_keys": keys} if keys else {}))
     port = url.rpartition(":")[2]
-    how: dict[str, Any] = {"additional_headers": bearer(TOKEN)}
+    options: dict[str, Any] = {"additional_headers": bearer(TOKEN)}
     foreign = (
         FOREIGN,
         "null",
@@ -156,9 +156,9 @@ def test_a_page_of_a_foreign_origin_is_refused_before_the_handshake(serve: Serve
         f"{LISTED}.x",
     )
     for origin in foreign:
-        assert refused(url, origin=origin, **how) == (403, "forbidden", None)
+        assert refused_handshake(url, origin=origin, **options) == (403, "forbidden", None)
     for origin in (LISTED, url, url.replace("http", "https")):
-        shaken(url, origin=origin, **how)
+        send_frame(url, origin=origin, **options)
     response = httpx.post(f"{url}/v1/detect", content=fakes.image_file(), headers={**bearer(TOKEN), "origin": FOREIGN})
     assert (response.status_code, response.json()["code"]) == (403, "forbidden")
 
@@ -178,7 +178,7 @@ def test_a_page_of_a_foreign_origin_is_refused_before_the_handshake(serve: Serve
         ("", "http://", 403),
     ],
 )
-def test_our_own_pages_are_told_by_host_and_port(guarded: str, host: str, origin: str, status: int) -> None:
+def test_own_pages_are_recognized_by_host_and_port(guarded: str, host: str, origin: str, status: int) -> None:
     headers = {"host": host, "origin": origin, **bearer(TOKEN)}
     assert httpx.get(f"{guarded}/v1/models", headers=headers).status_code == status
 
@@ -186,62 +186,64 @@ def test_our_own_pages_are_told_by_host_and_port(guarded: str, host: str, origin
 @pytest.mark.parametrize(
     ("host", "status"), [("localhost:1", 200), ("10.0.0.7", 200), ("[::1]:1", 200), ("lanes.test", 403)]
 )
-def test_without_keys_a_name_may_have_been_led_to_us(url: str, host: str, status: int) -> None:
+def test_without_keys_pages_opened_by_a_dns_name_are_refused(url: str, host: str, status: int) -> None:
     headers = {"host": host, "origin": f"http://{host}"}
     assert httpx.get(f"{url}/v1/models", headers=headers).status_code == status
 
 
-def test_pages_of_listed_origins_may_read_answers(guarded: str) -> None:
-    asked = {"access-control-request-method": "POST", "access-control-request-headers": "authorization"}
+def test_pages_of_listed_origins_may_read_responses(guarded: str) -> None:
+    preflight = {"access-control-request-method": "POST", "access-control-request-headers": "authorization"}
     for origin, allowed in ((LISTED, LISTED), (FOREIGN, None)):
         headers = {"origin": origin, **bearer(TOKEN)}
-        answers = [
-            httpx.options(f"{guarded}/v1/detect", headers={**asked, "origin": origin}),
+        responses = [
+            httpx.options(f"{guarded}/v1/detect", headers={**preflight, "origin": origin}),
             httpx.post(f"{guarded}/v1/detect", content=fakes.image_file(), headers=headers),
             httpx.get(f"{guarded}/v1/models", headers={"origin": origin}),
         ]
-        for answer in answers:
-            assert answer.headers.get("access-control-allow-origin") == allowed
-            assert "access-control-allow-credentials" not in answer.headers
-        assert [answer.status_code for answer in answers] == ([200, 200, 401] if allowed else [400, 403, 403])
+        for response in responses:
+            assert response.headers.get("access-control-allow-origin") == allowed
+            assert "access-control-allow-credentials" not in response.headers
+        assert [response.status_code for response in responses] == ([200, 200, 401] if allowed else [400, 403, 403])
 
 
-@pytest.mark.parametrize(("access", "without", "within"), [("keys", 401, 200), ("open", 200, 200), ("off", 404, 404)])
-def test_metrics_have_a_rule_of_their_own(serve: Serve, access: str, without: int, within: int) -> None:
+@pytest.mark.parametrize(
+    ("access", "without_key", "with_key"), [("keys", 401, 200), ("open", 200, 200), ("off", 404, 404)]
+)
+def test_access_to_metrics_is_a_setting(serve: Serve, access: str, without_key: int, with_key: int) -> None:
     url = serve(fakes.engine(), api_keys=str(KEY), metrics_access=access)
-    assert httpx.get(f"{url}/metrics").status_code == without
-    assert httpx.get(f"{url}/metrics", headers=bearer(TOKEN)).status_code == within
+    assert httpx.get(f"{url}/metrics").status_code == without_key
+    assert httpx.get(f"{url}/metrics", headers=bearer(TOKEN)).status_code == with_key
 
 
 def test_refusals_are_counted(guarded: str) -> None:
     httpx.get(f"{guarded}/v1/models")
-    refused(guarded)
-    refused(guarded, origin=FOREIGN)
-    told = httpx.get(f"{guarded}/metrics", headers=bearer(TOKEN)).text
-    assert 'lane_refusals_total{code="unauthorized"} 2.0' in told
-    assert 'lane_refusals_total{code="forbidden"} 1.0' in told
+    refused_handshake(guarded)
+    refused_handshake(guarded, origin=FOREIGN)
+    metrics = httpx.get(f"{guarded}/metrics", headers=bearer(TOKEN)).text
+    assert 'lane_refusals_total{code="unauthorized"} 2.0' in metrics
+    assert 'lane_refusals_total{code="forbidden"} 1.0' in metrics
 
 
-def test_keys_come_from_a_file_too(serve: Serve, tmp_path: Path) -> None:
+def test_keys_are_also_read_from_a_file(serve: Serve, tmp_path: Path) -> None:
     (tmp_path / "keys").write_text(f"# cameras\n{KEY}\n")
     url = serve(fakes.engine(), api_keys=str(OTHER_KEY), api_keys_file=tmp_path / "keys")
     for token in (TOKEN, OTHER_TOKEN):
         assert httpx.get(f"{url}/v1/models", headers=bearer(token)).status_code == 200
     (tmp_path / "keys").write_text("camera-7: what?\n")
-    with pytest.raises(SettingsError, match="line 1 is no key"):
+    with pytest.raises(SettingsError, match="line 1 is not a valid key"):
         create_app(None, Settings(api_keys_file=tmp_path / "keys"))
 
 
-def test_the_command_makes_keys_that_open(serve: Serve) -> None:
-    made = subprocess.run(
+def test_the_key_command_creates_valid_keys(serve: Serve) -> None:
+    completed = subprocess.run(
         [sys.executable, "-m", "lanestream.cli", "key", "camera-9"],
         capture_output=True,
         text=True,
         check=True,
         timeout=30,
     )
-    told = dict(line.split(": ", 1) for line in made.stdout.splitlines())
-    token, setting = told["key"].strip(), told["setting"].strip()
+    output = dict(line.split(": ", 1) for line in completed.stdout.splitlines())
+    token, setting = output["key"].strip(), output["setting"].strip()
     assert setting.startswith("camera-9:")
     assert token not in setting
     url = serve(fakes.engine(), api_keys=setting)
@@ -254,30 +256,31 @@ def _with_key(token: str, *, in_header: bool) -> dict[str, Any]:
     )
 
 
-def start(socket: ClientConnection, **more: str) -> dict[str, Any]:
-    socket.send(json.dumps({"type": "start", **more}))
-    told: dict[str, Any] = json.loads(socket.recv(fakes.WAIT_S))
-    return told
+def start(socket: ClientConnection, **fields: str) -> dict[str, Any]:
+    """Sends `start` and returns the reply."""
+    socket.send(json.dumps({"type": "start", **fields}))
+    reply: dict[str, Any] = json.loads(socket.recv(fakes.WAIT_S))
+    return reply
 
 
-def test_sessions_belong_to_a_key_and_are_counted_by_it(serve: Serve) -> None:
+def test_sessions_belong_to_a_key_and_are_limited_per_key(serve: Serve) -> None:
     url = serve(fakes.engine(), api_keys=f"{KEY},{OTHER_KEY}", max_sessions_per_caller=1)
-    place = f"{url.replace('http', 'ws')}/v1/stream"
-    with connect(place, additional_headers=bearer(TOKEN)) as mine:
+    stream_url = f"{url.replace('http', 'ws')}/v1/stream"
+    with connect(stream_url, additional_headers=bearer(TOKEN)) as mine:
         token = start(mine)["resume_token"]
-        with connect(place, additional_headers=bearer(TOKEN)) as second:
+        with connect(stream_url, additional_headers=bearer(TOKEN)) as second:
             assert start(second)["code"] == "busy"
-        with connect(place, additional_headers=bearer(OTHER_TOKEN)) as theirs:
+        with connect(stream_url, additional_headers=bearer(OTHER_TOKEN)) as theirs:
             assert start(theirs, resume_token=token)["resumed"] is False
         mine.send(fakes.image_file())
-        assert json.loads(mine.recv(fakes.WAIT_S))["type"] == "lanes", "and mine goes on"
-    all_released(url, **bearer(TOKEN))
-    with connect(place, additional_headers=bearer(TOKEN)) as again:
+        assert json.loads(mine.recv(fakes.WAIT_S))["type"] == "lanes", "the first session is not affected"
+    wait_until_released(url, **bearer(TOKEN))
+    with connect(stream_url, additional_headers=bearer(TOKEN)) as again:
         assert start(again, resume_token=token)["resumed"] is True
 
 
-def log_of(arguments: list[str], settings: dict[str, str], use: Callable[[str], None]) -> list[str]:
-    """The lines that `lanestream serve` logs while it is used."""
+def log_lines(arguments: list[str], settings: dict[str, str], use: Callable[[str], None]) -> list[str]:
+    """Returns the lines that `lanestream serve` logs while `use` is called with its URL."""
     command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu", *arguments]
     environment = {**os.environ, **settings}
     with subprocess.Popen(
@@ -301,19 +304,19 @@ def log_of(arguments: list[str], settings: dict[str, str], use: Callable[[str], 
     return [*lines, *errors.splitlines(keepends=True)]
 
 
-def test_no_key_gets_into_the_log() -> None:
-    wrong = "lane_a-key-that-is-not-known"
+def test_keys_are_never_logged() -> None:
+    wrong = "lane_an-unknown-key"
 
     def use(url: str) -> None:
         for token in (TOKEN, wrong):
             httpx.get(f"{url}/v1/models?key={token}", headers=bearer(token))
         for in_header in (True, False):
-            shaken(url, **_with_key(TOKEN, in_header=in_header))
-            assert refused(url, **_with_key(wrong, in_header=in_header))[0] == 401
+            send_frame(url, **_with_key(TOKEN, in_header=in_header))
+            assert refused_handshake(url, **_with_key(wrong, in_header=in_header))[0] == 401
         with pytest.raises(InvalidStatus), connect(f"{url.replace('http', 'ws')}/v1/stream?key={TOKEN}"):
             pass
 
-    lines = log_of(["--log-format", "json", "--log-level", "debug"], {"LANESTREAM_API_KEYS": str(KEY)}, use)
+    lines = log_lines(["--log-format", "json", "--log-level", "debug"], {"LANESTREAM_API_KEYS": str(KEY)}, use)
     records = [json.loads(line) for line in lines]
     assert all({"time", "level", "logger", "message"} <= set(record) for record in records)
     assert {record["logger"] for record in records} >= {"lanestream.api.server", "uvicorn.access", "uvicorn.error"}
@@ -326,15 +329,15 @@ def test_no_key_gets_into_the_log() -> None:
         assert secret not in "".join(lines)
 
 
-def test_a_service_for_everybody_says_so_loudly() -> None:
-    lines = log_of(["--host", "0.0.0.0"], {}, lambda url: None)  # noqa: S104
+def test_a_service_without_keys_logs_a_warning() -> None:
+    lines = log_lines(["--host", "0.0.0.0"], {}, lambda url: None)  # noqa: S104
     (warning,) = [line for line in lines if " WARNING " in line]
-    assert "NO API KEYS: everybody who can reach 0.0.0.0 may use this service" in warning
+    assert "NO API KEYS: everyone who can reach 0.0.0.0 may use this service" in warning
     assert "lanestream key NAME" in warning
 
 
 @pytest.mark.parametrize(("keys", "loopback"), [((KEY,), False), ((KEY,), True), ((), True)], ids=range(3))
-def test_a_service_with_keys_or_for_this_machine_alone_does_not(
+def test_a_service_with_keys_or_on_loopback_logs_no_warning(
     caplog: pytest.LogCaptureFixture, keys: tuple[ApiKey, ...], loopback: bool
 ) -> None:
     warn_if_open(Authenticator(keys), "a host", loopback=loopback)

@@ -1,4 +1,4 @@
-"""Requests that are slow, that lie about their length, or that no client library would send, over plain sockets."""
+"""Slow requests, wrong lengths and other requests that no client library would send, over plain sockets."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from urllib.parse import urlsplit
 import fakes
 import httpx
 import pytest
-from talking import heard, stream, tell
+from wsclient import receive, send_message, stream
 
 Serve = Callable[..., str]
 IMAGE = fakes.image_file()
 
 
-def begun(url: str, *headers: str, body: bytes = b"") -> socket.socket:
-    """A connection on which a request to find lanes has begun."""
-    place = urlsplit(url)
-    assert place.hostname is not None
-    connection = socket.create_connection((place.hostname, place.port or 80), timeout=fakes.WAIT_S)
+def begin_request(url: str, *headers: str, body: bytes = b"") -> socket.socket:
+    """Opens a connection and sends the beginning of a `POST /v1/detect`."""
+    address = urlsplit(url)
+    assert address.hostname is not None
+    connection = socket.create_connection((address.hostname, address.port or 80), timeout=fakes.WAIT_S)
     lines = ["POST /v1/detect HTTP/1.1", "Host: x", *headers, "", ""]
     connection.sendall("\r\n".join(lines).encode() + body)
     return connection
 
 
-def answer(connection: socket.socket) -> tuple[int, bytes, bytes]:
-    """Status, headers and body of all that comes until the service closes."""
+def read_response(connection: socket.socket) -> tuple[int, bytes, bytes]:
+    """Reads until the service closes the connection. Returns the status, the headers and the body."""
     data = b""
     while part := connection.recv(1 << 16):
         data += part
@@ -35,17 +35,17 @@ def answer(connection: socket.socket) -> tuple[int, bytes, bytes]:
     return int(head.split()[1]), head.lower(), body
 
 
-def refused(connection: socket.socket) -> tuple[int, str]:
-    """Status and code of the one problem that the service tells before it closes the connection."""
+def read_problem(connection: socket.socket) -> tuple[int, str]:
+    """Returns the status and code of the error response after which the service closes the connection."""
     with connection:
-        status, head, body = answer(connection)
+        status, head, body = read_response(connection)
     assert b"connection: close" in head
-    told = json.loads(body)
-    assert set(told) == {"code", "message", "hint"}
-    return status, told["code"]
+    problem = json.loads(body)
+    assert set(problem) == {"code", "message", "hint"}
+    return status, problem["code"]
 
 
-def lives(url: str) -> None:
+def check_alive(url: str) -> None:
     assert httpx.post(f"{url}/v1/detect", content=IMAGE).status_code == 200
 
 
@@ -59,82 +59,90 @@ def lives(url: str) -> None:
         ([f"Content-Length: {len(IMAGE)}", "Content-Type: multipart/form-data; boundary=b"], b"--b\r\n"),
     ],
 )
-def test_a_body_that_stops_is_waited_for_and_then_refused(serve: Serve, headers: list[str], body: bytes) -> None:
-    place = serve(fakes.engine(), body_s=0.2)
-    assert refused(begun(place, *headers, body=body)) == (408, "idle")
-    metrics = httpx.get(f"{place}/metrics").text
+def test_an_incomplete_body_is_refused_after_its_time_limit(serve: Serve, headers: list[str], body: bytes) -> None:
+    url = serve(fakes.engine(), body_s=0.2)
+    assert read_problem(begin_request(url, *headers, body=body)) == (408, "idle")
+    metrics = httpx.get(f"{url}/metrics").text
     assert 'lane_refusals_total{code="idle"} 1.0' in metrics
-    lives(place)
+    check_alive(url)
 
 
-@pytest.mark.parametrize("said", [b"", b"G", b"GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: "])
-def test_a_head_that_stops_is_waited_for_and_then_refused(serve: Serve, said: bytes) -> None:
-    place = urlsplit(serve(fakes.engine(), handshake_s=0.2))
-    address = (place.hostname, place.port)
+@pytest.mark.parametrize("sent", [b"", b"G", b"GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: "])
+def test_an_incomplete_head_is_refused_after_its_time_limit(serve: Serve, sent: bytes) -> None:
+    url = serve(fakes.engine(), handshake_s=0.2)
+    address = (urlsplit(url).hostname, urlsplit(url).port)
     with socket.create_connection(address, timeout=fakes.WAIT_S) as silent:
-        silent.sendall(said)
-        assert answer(silent)[:2] == (408, b"http/1.1 408 request timeout\r\nconnection: close\r\ncontent-length: 0")
+        silent.sendall(sent)
+        assert read_response(silent)[:2] == (
+            408,
+            b"http/1.1 408 request timeout\r\nconnection: close\r\ncontent-length: 0",
+        )
     with socket.create_connection(address, timeout=fakes.WAIT_S) as second:
         second.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
         assert second.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
-        second.sendall(said)
+        second.sendall(sent)
         assert b"200 OK" not in b"".join(iter(lambda: second.recv(1 << 16), b""))
-    lives(place.geturl())
+    check_alive(url)
 
 
-def test_a_head_that_came_in_time_has_all_the_time_it_needs(serve: Serve) -> None:
-    place = serve(fakes.engine(), handshake_s=0.2)
-    with begun(place, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]) as slow, stream(place, mode="all") as camera:
+def test_the_time_limit_of_the_head_does_not_apply_to_the_body(serve: Serve) -> None:
+    url = serve(fakes.engine(), handshake_s=0.2)
+    with (
+        begin_request(url, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]) as slow,
+        stream(url, mode="all") as camera,
+    ):
         fakes.pause(0.5)
         slow.sendall(IMAGE[500:])
         assert slow.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
         camera.send(IMAGE)
-        assert heard(camera)["type"] == "lanes"
+        assert receive(camera)["type"] == "lanes"
 
 
-def test_a_slow_body_holds_no_session(serve: Serve) -> None:
-    place = serve(fakes.engine(), max_sessions=1)
-    with begun(place, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]) as slow:
-        busy = httpx.post(f"{place}/v1/detect", content=IMAGE)
-        assert (busy.status_code, busy.json()["code"]) == (503, "busy"), "one body at a time is received"
-        with stream(place, mode="all") as camera:
+def test_a_slow_body_does_not_occupy_a_session(serve: Serve) -> None:
+    url = serve(fakes.engine(), max_sessions=1)
+    with begin_request(url, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]) as slow:
+        busy = httpx.post(f"{url}/v1/detect", content=IMAGE)
+        assert (busy.status_code, busy.json()["code"]) == (503, "busy"), (
+            "as many bodies are received at a time as there may be sessions"
+        )
+        with stream(url, mode="all") as camera:
             camera.send(IMAGE)
-            assert heard(camera)["type"] == "lanes"
-            tell(camera, "end")
-            assert heard(camera)["type"] == "summary"
+            assert receive(camera)["type"] == "lanes"
+            send_message(camera, "end")
+            assert receive(camera)["type"] == "summary"
         slow.sendall(IMAGE[500:])
         assert slow.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
 
 
-def test_a_client_that_leaves_in_the_middle_frees_its_place(serve: Serve) -> None:
-    place = serve(fakes.engine(), max_sessions=1)
+def test_a_client_that_disconnects_no_longer_counts(serve: Serve) -> None:
+    url = serve(fakes.engine(), max_sessions=1)
     for _ in range(3):
-        begun(place, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]).close()
-        lives_again(place)
+        begin_request(url, f"Content-Length: {len(IMAGE)}", body=IMAGE[:500]).close()
+        wait_until_accepted(url)
 
 
-def lives_again(url: str) -> None:
-    """Waits until the service has noticed that a client left."""
+def wait_until_accepted(url: str) -> None:
+    """Repeats a request until the service has noticed that a client disconnected."""
     while (response := httpx.post(f"{url}/v1/detect", content=IMAGE)).status_code == 503:
         assert response.json()["code"] == "busy"
     assert response.status_code == 200
 
 
-def test_what_is_refused_anyway_is_refused_before_its_body_comes(serve: Serve) -> None:
-    place = serve(fakes.engine(), max_bytes=10_000)
-    for headers, told in (
+def test_requests_are_refused_before_their_body_arrives_if_possible(serve: Serve) -> None:
+    url = serve(fakes.engine(), max_bytes=10_000)
+    for headers, expected in (
         (["Content-Length: 999999999999"], (413, "image_too_large")),
         (["Content-Length: 80000", "Content-Type: multipart/form-data; boundary=b"], (413, "image_too_large")),
     ):
-        assert refused(begun(place, *headers)) == told
-    for headers, told in (
+        assert read_problem(begin_request(url, *headers)) == expected
+    for headers, expected in (
         (["Accept: text/html", "Content-Length: 9"], (406, "not_acceptable")),
         (["Origin: http://elsewhere", "Content-Length: 9"], (403, "forbidden")),
     ):
-        with begun(place, *headers) as connection:
+        with begin_request(url, *headers) as connection:
             head = connection.recv(1 << 16)
-        assert int(head.split()[1]) == told[0]
-        assert told[1].encode() in head
+        assert int(head.split()[1]) == expected[0]
+        assert expected[1].encode() in head
 
 
 @pytest.mark.parametrize(
@@ -148,14 +156,14 @@ def test_what_is_refused_anyway_is_refused_before_its_body_comes(serve: Serve) -
         ["Content-Length: 5"],
     ],
 )
-def test_a_length_that_is_a_lie_ends_the_connection(url: str, headers: list[str]) -> None:
-    with begun(url, *headers, body=b"hello, how are you?") as connection:
-        assert answer(connection)[0] == 400
-    lives(url)
+def test_a_wrong_length_closes_the_connection(url: str, headers: list[str]) -> None:
+    with begin_request(url, *headers, body=b"hello, how are you?") as connection:
+        assert read_response(connection)[0] == 400
+    check_alive(url)
 
 
 @pytest.mark.parametrize("charset", ["undefined", "idna", "utf-16", "hex", "no such"])
-def test_a_form_in_an_odd_encoding_is_read_or_refused(url: str, charset: str) -> None:
+def test_a_form_in_an_unusual_encoding_is_refused(url: str, charset: str) -> None:
     part = b'--b\r\nContent-Disposition: form-data; name="a..b"\r\n\r\nx\r\n--b--\r\n'
     kind = f'Multipart/Form-Data; boundary=b; charset="{charset}"'
     response = httpx.post(f"{url}/v1/detect", content=part, headers={"content-type": kind})

@@ -70,8 +70,8 @@ def test_an_incomplete_camera_is_refused(url: str, query: dict[str, float]) -> N
     response = detect(url, **query)
     assert (response.status_code, response.json()["code"]) == (422, "bad_message")
     missing = "height" if "field_of_view" in query else "field_of_view"
-    assert response.json()["message"].startswith(f"not a camera: {missing}: ")
-    assert response.json()["hint"].startswith("give both its height")
+    assert response.json()["message"].startswith(f"not a valid camera: {missing}: ")
+    assert response.json()["hint"].startswith("give both the height")
 
 
 @pytest.mark.parametrize(
@@ -135,9 +135,9 @@ def test_the_commands_take_a_camera(
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (OPTIONS[:2], 1, "error: not a camera: field_of_view: "),
-        (OPTIONS[2:], 1, "error: not a camera: height: "),
-        ([*OPTIONS[:2], "--field-of-view", "nan"], 1, "error: not a camera: field_of_view: "),
+        (OPTIONS[:2], 1, "error: not a valid camera: field_of_view: "),
+        (OPTIONS[2:], 1, "error: not a valid camera: height: "),
+        ([*OPTIONS[:2], "--field-of-view", "nan"], 1, "error: not a valid camera: field_of_view: "),
         (["--camera-height", "9", *OPTIONS[2:]], 2, "Usage: "),
     ],
 )

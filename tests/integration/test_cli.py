@@ -314,7 +314,7 @@ def test_an_invalid_url_is_reported_without_its_password(run: Run, monkeypatch: 
 def test_an_invalid_key_name_is_reported(run: Run) -> None:
     code, output, errors = run("key", "camera 7")
     assert (code, output) == (1, "")
-    assert errors.startswith("error: 'camera 7' can't be the name of a key (")
+    assert errors.startswith("error: 'camera 7' is not a valid name for a key (")
 
 
 @pytest.mark.parametrize("option", ["--model", "--regressor"])

@@ -1,4 +1,4 @@
-"""SIGTERM under load: a service answers what it has taken, says where to go on, and only then closes."""
+"""SIGTERM under load: the service answers accepted frames, announces the stop and only then closes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import httpx
 import pytest
 from processes import service
 from redisserver import redis_server
-from talking import closed, heard, stream, tell
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from wsclient import receive, receive_close, send_message, stream
 
 from lanestream.api import create_app
-from lanestream.api.server import Server, listen
+from lanestream.api.server import LanestreamServer, listen
 from lanestream.settings import Settings
 
 CREDITS = 4
@@ -27,41 +27,41 @@ STREAMS = 4
 
 
 @dataclass
-class Camera:
-    """A client in mode `all` that keeps all its credits in use until the service closes."""
+class CameraClient:
+    """A client in mode `all` that uses all its credits until the service closes."""
 
     url: str
     started: threading.Barrier
-    told: list[dict[str, object]] = field(default_factory=list)
+    received: list[dict[str, object]] = field(default_factory=list)
     code: int | None = None
 
     def run(self) -> None:
         picture = fakes.image_file(width=640, height=360)
         with stream(self.url) as socket:
-            tell(socket, "start", mode="all")
-            self.told.append(heard(socket))
+            send_message(socket, "start", mode="all")
+            self.received.append(receive(socket))
             for _ in range(CREDITS):
                 socket.send(picture)
             try:
                 while True:
-                    self.told.append(heard(socket))
-                    if len(self.told) == CREDITS + 1:
+                    self.received.append(receive(socket))
+                    if len(self.received) == CREDITS + 1:
                         self.started.wait(fakes.WAIT_S)
-                    if self.told[-1]["type"] != "draining":
-                        # Where the service has closed meanwhile, what it said before is still to be heard.
+                    if self.received[-1]["type"] != "draining":
+                        # The service may have closed by now; its earlier messages can still be received.
                         with suppress(ConnectionClosed):
                             socket.send(picture)
-            except ConnectionClosed as end:
-                self.code = None if end.rcvd is None else end.rcvd.code
+            except ConnectionClosed as closed:
+                self.code = None if closed.rcvd is None else closed.rcvd.code
 
-    def of(self, kind: str) -> list[dict[str, object]]:
-        return [message for message in self.told if message["type"] == kind]
+    def messages(self, kind: str) -> list[dict[str, object]]:
+        return [message for message in self.received if message["type"] == kind]
 
 
 def test_sigterm_under_load_leaves_no_accepted_frame_unanswered(tmp_path: Path) -> None:
     with redis_server(tmp_path) as redis_url, service(credits=CREDITS, redis_url=redis_url) as (process, url):
         started = threading.Barrier(STREAMS + 1)
-        cameras = [Camera(url, started) for _ in range(STREAMS)]
+        cameras = [CameraClient(url, started) for _ in range(STREAMS)]
         threads = [threading.Thread(target=camera.run) for camera in cameras]
         for thread in threads:
             thread.start()
@@ -79,39 +79,41 @@ def test_sigterm_under_load_leaves_no_accepted_frame_unanswered(tmp_path: Path) 
             assert dropped == 0
         for camera in cameras:
             assert camera.code == 1012
-            (draining,) = camera.of("draining")
-            assert draining["resume_token"] == camera.of("ready")[0]["resume_token"]
-            replies = [message for message in camera.told if message["type"] in ("lanes", "error")]
+            (draining,) = camera.messages("draining")
+            assert draining["resume_token"] == camera.messages("ready")[0]["resume_token"]
+            replies = [message for message in camera.received if message["type"] in ("lanes", "error")]
             assert [reply["seq"] for reply in replies] == list(range(len(replies))), (
-                "answers come in order, none is left out"
+                "replies come in order, and none is missing"
             )
-            assert {error["code"] for error in camera.of("error")} <= {"draining"}
-        told = sorted(sum(message["type"] in ("lanes", "error") for message in camera.told) for camera in cameras)
-        assert told == sorted(int(count[0]) for count in counts), "every frame that the service took was answered"
+            assert {error["code"] for error in camera.messages("error")} <= {"draining"}
+        replied = sorted(
+            sum(message["type"] in ("lanes", "error") for message in camera.received) for camera in cameras
+        )
+        assert replied == sorted(int(count[0]) for count in counts), "every accepted frame was answered"
         with service(redis_url=redis_url) as (_, other):
             for camera in cameras:
                 with stream(other) as socket:
-                    tell(socket, "start", mode="all", resume_token=camera.of("ready")[0]["resume_token"])
-                    ready = heard(socket)
+                    send_message(socket, "start", mode="all", resume_token=camera.messages("ready")[0]["resume_token"])
+                    ready = receive(socket)
                     assert ready["resumed"]
-                    assert ready["last_seq"] == camera.of("lanes")[-1]["seq"]
+                    assert ready["last_seq"] == camera.messages("lanes")[-1]["seq"]
 
 
-def test_while_it_drains_a_service_takes_nothing_new_and_finishes_what_it_has() -> None:
+def test_a_draining_service_refuses_new_work_and_finishes_accepted_frames() -> None:
     network = fakes.GatedNetwork()
     app = create_app(fakes.engine(network), Settings(), None)
     listener = listen("127.0.0.1", 0)
-    server = Server(app, Settings())
+    server = LanestreamServer(app, Settings())
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     with stream(url) as socket:
-        tell(socket, "start", mode="all")
-        heard(socket)
+        send_message(socket, "start", mode="all")
+        receive(socket)
         socket.send(fakes.image_file())
         network.wait_for_a_frame()
         server.should_exit = True
-        assert heard(socket)["type"] == "draining"
+        assert receive(socket)["type"] == "draining"
         socket.send(fakes.image_file())
         assert httpx.get(f"{url}/healthz").is_success
         refused = httpx.get(f"{url}/readyz")
@@ -121,7 +123,7 @@ def test_while_it_drains_a_service_takes_nothing_new_and_finishes_what_it_has() 
             pass
         assert json.loads(denied.value.response.body or b"")["code"] == "draining"
         network.let_through()
-        assert (heard(socket)["type"], heard(socket)["code"]) == ("lanes", "draining")
-        assert closed(socket)[0] == 1012
+        assert (receive(socket)["type"], receive(socket)["code"]) == ("lanes", "draining")
+        assert receive_close(socket)[0] == 1012
     thread.join(fakes.WAIT_S)
     assert not thread.is_alive()

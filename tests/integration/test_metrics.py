@@ -1,4 +1,4 @@
-"""What Prometheus is told, by requests over real sockets."""
+"""The Prometheus metrics, by requests over real sockets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import fakes
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from talking import all_released, all_was_read, closed, heard, stream, tell
+from wsclient import receive, receive_close, send_message, stream, wait_until_read, wait_until_released
 
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR
 
@@ -21,7 +21,7 @@ Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
 def samples(url: str, **headers: str) -> Samples:
-    """Every sample of the service, by its name and its labels."""
+    """Returns every sample of the service by name and labels."""
     response = httpx.get(f"{url}/metrics", headers=headers)
     assert response.status_code == 200
     assert response.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
@@ -32,25 +32,27 @@ def samples(url: str, **headers: str) -> Samples:
     }
 
 
-def value(found: Samples, name: str, /, **labels: str) -> float:
-    return found[name, frozenset(labels.items())]
+def value(metrics: Samples, name: str, /, **labels: str) -> float:
+    return metrics[name, frozenset(labels.items())]
 
 
 def test_an_image_is_counted_and_timed(serve: Serve) -> None:
     url = serve(fakes.engine())
     assert value(samples(url), "lane_frames_received_total") == 0
     assert httpx.post(f"{url}/v1/detect", content=fakes.image_file()).status_code == 200
-    found = samples(url)
-    assert value(found, "lane_frames_received_total") == 1
-    assert value(found, "lane_frames_processed_total") == 1
-    assert value(found, "lane_frame_age_seconds_count") == 1
+    metrics = samples(url)
+    assert value(metrics, "lane_frames_received_total") == 1
+    assert value(metrics, "lane_frames_processed_total") == 1
+    assert value(metrics, "lane_frame_age_seconds_count") == 1
     stages = ("decode", "propose", "queue", "infer", "track")
-    assert [value(found, "lane_stage_seconds_count", stage=stage) for stage in stages] == [1.0] * 5
-    assert value(found, "lane_frame_age_seconds_sum") >= value(found, "lane_stage_seconds_sum", stage="decode") > 0.0
-    assert value(found, "lane_batch_size_count", network="fake 1") == 1
-    assert value(found, "lane_batch_size_sum", network="fake 1") == 2
-    assert value(found, "lane_batch_wait_seconds_count", network="fake 1") == 1
-    assert value(found, "lane_queue_depth") == 0
+    assert [value(metrics, "lane_stage_seconds_count", stage=stage) for stage in stages] == [1.0] * 5
+    assert (
+        value(metrics, "lane_frame_age_seconds_sum") >= value(metrics, "lane_stage_seconds_sum", stage="decode") > 0.0
+    )
+    assert value(metrics, "lane_batch_size_count", network="fake 1") == 1
+    assert value(metrics, "lane_batch_size_sum", network="fake 1") == 2
+    assert value(metrics, "lane_batch_wait_seconds_count", network="fake 1") == 1
+    assert value(metrics, "lane_queue_depth") == 0
 
 
 @pytest.mark.parametrize(
@@ -61,52 +63,52 @@ def test_an_image_is_counted_and_timed(serve: Serve) -> None:
         (fakes.image_file(shade=255), "error", "internal"),
     ],
 )
-def test_a_refused_image_is_counted_with_the_reason(serve: Serve, data: bytes, reason: str, code: str) -> None:
+def test_a_refused_image_is_counted_with_its_reason(serve: Serve, data: bytes, reason: str, code: str) -> None:
     url = serve(fakes.engine())
     httpx.post(f"{url}/v1/detect", content=data)
-    found = samples(url)
-    assert value(found, "lane_frames_received_total") == 1
-    assert value(found, "lane_frames_processed_total") == 0
-    dropped = {dict(labels)["reason"]: count for (name, labels), count in found.items() if "dropped_total" in name}
+    metrics = samples(url)
+    assert value(metrics, "lane_frames_received_total") == 1
+    assert value(metrics, "lane_frames_processed_total") == 0
+    dropped = {dict(labels)["reason"]: count for (name, labels), count in metrics.items() if "dropped_total" in name}
     assert {name for name, count in dropped.items() if count} == {reason}
-    assert value(found, "lane_refusals_total", code=code) == 1
+    assert value(metrics, "lane_refusals_total", code=code) == 1
 
 
-def test_a_path_that_is_not_there_is_counted_as_a_refusal(serve: Serve) -> None:
+def test_an_unknown_path_is_counted_as_a_refusal(serve: Serve) -> None:
     url = serve(fakes.engine())
     httpx.get(f"{url}/nothing")
     httpx.get(f"{url}/v1/detect")
-    found = samples(url)
-    assert value(found, "lane_refusals_total", code="not_found") == 1
-    assert value(found, "lane_refusals_total", code="method_not_allowed") == 1
+    metrics = samples(url)
+    assert value(metrics, "lane_refusals_total", code="not_found") == 1
+    assert value(metrics, "lane_refusals_total", code="method_not_allowed") == 1
 
 
-def test_what_runs_is_told_once_it_is_loaded(serve: Serve) -> None:
+def test_networks_are_reported_once_they_are_loaded(serve: Serve) -> None:
     name, labels = "lane_inference_provider_info", {"provider": "cpu", "device": "cpu", "precision": "unknown"}
     assert all(name != sample for sample, _ in samples(serve()))
-    found = samples(serve(fakes.two_detectors()))
+    metrics = samples(serve(fakes.two_detectors()))
     for network in ("fake 1", "other 2"):
-        assert value(found, name, network=network, **labels) == 1
-        assert value(found, "lane_provider_fallback", network=network) == 0
-        assert value(found, "lane_model_info", name=network, version="unknown", sha256="fa4e") == 1
+        assert value(metrics, name, network=network, **labels) == 1
+        assert value(metrics, "lane_provider_fallback", network=network) == 0
+        assert value(metrics, "lane_model_info", name=network, version="unknown", sha256="fa4e") == 1
 
 
-def test_a_provider_that_was_missed_is_told(serve: Serve) -> None:
-    class Fallen(fakes.FakeNetwork):
+def test_a_provider_fallback_is_reported(serve: Serve) -> None:
+    class FallbackNetwork(fakes.FakeNetwork):
         fell_back = True
 
-    found = samples(serve(fakes.engine(Fallen())))
-    assert value(found, "lane_provider_fallback", network="fake 1") == 1
+    metrics = samples(serve(fakes.engine(FallbackNetwork())))
+    assert value(metrics, "lane_provider_fallback", network="fake 1") == 1
 
 
-def test_the_shipped_networks_are_told_by_their_files(real_url: str) -> None:
-    found = samples(real_url)
-    told = {dict(labels)["name"]: dict(labels) for name, labels in found if name == "lane_model_info"}
+def test_the_shipped_networks_are_reported_with_their_files(real_url: str) -> None:
+    metrics = samples(real_url)
+    models = {dict(labels)["name"]: dict(labels) for name, labels in metrics if name == "lane_model_info"}
     for path in (SHIPPED_MODEL, SHIPPED_REGRESSOR):
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        (entry,) = [each for each in told.values() if each["sha256"] == digest]
-        assert entry["version"].count(".") == 2
-    labels = {dict(labels)["precision"] for name, labels in found if name == "lane_inference_provider_info"}
+        (model,) = [model for model in models.values() if model["sha256"] == digest]
+        assert model["version"].count(".") == 2
+    labels = {dict(labels)["precision"] for name, labels in metrics if name == "lane_inference_provider_info"}
     assert labels <= {"int8", "fp16", "fp32"}
 
 
@@ -118,61 +120,61 @@ def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
         network.wait_for_a_frame()
         for _ in range(4):
             socket.send(fakes.image_file())
-        all_was_read(socket)
-        found = samples(url)
-        assert value(found, "lane_sessions_active") == 1
-        assert value(found, "lane_frames_received_total") == 5
-        assert value(found, "lane_frames_dropped_total", reason="superseded") == 3
-        assert value(found, "lane_frames_processed_total") == 0
+        wait_until_read(socket)
+        metrics = samples(url)
+        assert value(metrics, "lane_sessions_active") == 1
+        assert value(metrics, "lane_frames_received_total") == 5
+        assert value(metrics, "lane_frames_dropped_total", reason="superseded") == 3
+        assert value(metrics, "lane_frames_processed_total") == 0
         network.let_through(2)
-        assert [heard(socket)["type"] for _ in range(2)] == ["lanes", "lanes"]
+        assert [receive(socket)["type"] for _ in range(2)] == ["lanes", "lanes"]
         socket.send(b"no image")
-        assert heard(socket)["code"] == "bad_image"
-        tell(socket, "end")
-        assert heard(socket)["type"] == "summary"
-        assert closed(socket)[0] == 1000
-    all_released(url)
-    found = samples(url)
-    assert value(found, "lane_frames_processed_total") == value(found, "lane_frame_age_seconds_count") == 2
-    assert value(found, "lane_frames_dropped_total", reason="decode_error") == 1
-    assert value(found, "lane_refusals_total", code="bad_message") == 1
-    assert value(found, "lane_refusals_total", code="bad_image") == 1
-    assert value(found, "lane_ws_closes_total", code="1000") == 1
-    dropped = sum(count for (name, _), count in found.items() if name == "lane_frames_dropped_total")
-    assert value(found, "lane_frames_received_total") == dropped + value(found, "lane_frames_processed_total")
+        assert receive(socket)["code"] == "bad_image"
+        send_message(socket, "end")
+        assert receive(socket)["type"] == "summary"
+        assert receive_close(socket)[0] == 1000
+    wait_until_released(url)
+    metrics = samples(url)
+    assert value(metrics, "lane_frames_processed_total") == value(metrics, "lane_frame_age_seconds_count") == 2
+    assert value(metrics, "lane_frames_dropped_total", reason="decode_error") == 1
+    assert value(metrics, "lane_refusals_total", code="bad_message") == 1
+    assert value(metrics, "lane_refusals_total", code="bad_image") == 1
+    assert value(metrics, "lane_ws_closes_total", code="1000") == 1
+    dropped = sum(count for (name, _), count in metrics.items() if name == "lane_frames_dropped_total")
+    assert value(metrics, "lane_frames_received_total") == dropped + value(metrics, "lane_frames_processed_total")
 
 
-def test_frames_whose_client_is_gone_are_counted_too(serve: Serve) -> None:
+def test_frames_of_a_disconnected_client_are_counted(serve: Serve) -> None:
     network = fakes.GatedNetwork()
     url = serve(fakes.engine(network))
     with stream(url, mode="all") as socket:
         for _ in range(3):
             socket.send(fakes.image_file())
         network.wait_for_a_frame()
-        all_was_read(socket)
+        wait_until_read(socket)
     network.let_through(3)
-    all_released(url)
-    found = samples(url)
-    assert value(found, "lane_frames_received_total") == 3
-    assert value(found, "lane_frames_dropped_total", reason="disconnected") == 3
+    wait_until_released(url)
+    metrics = samples(url)
+    assert value(metrics, "lane_frames_received_total") == 3
+    assert value(metrics, "lane_frames_dropped_total", reason="disconnected") == 3
 
 
-def test_the_manual_has_every_metric(url: str) -> None:
+def test_the_operations_page_has_every_metric(url: str) -> None:
     httpx.post(f"{url}/v1/detect", content=b"no image")
     families = text_string_to_metric_families(httpx.get(f"{url}/metrics").text)
-    told = {
+    names = {
         f"{family.name}_total" if family.type == "counter" else family.name
         for family in families
         if family.name.startswith("lane_") and not family.name.endswith("_created")
     }
-    assert told == set(re.findall(r"^\| `(lane_\w+)` \|", OPERATIONS.read_text(), re.MULTILINE))
+    assert names == set(re.findall(r"^\| `(lane_\w+)` \|", OPERATIONS.read_text(), re.MULTILINE))
 
 
-def test_services_of_one_process_count_apart(serve: Serve) -> None:
+def test_applications_in_one_process_have_separate_metrics(serve: Serve) -> None:
     one, other = serve(fakes.engine()), serve(fakes.engine())
     httpx.post(f"{one}/v1/detect", content=fakes.image_file())
     assert [value(samples(url), "lane_frames_received_total") for url in (one, other)] == [1.0, 0.0]
 
 
-def test_the_process_is_told_too(url: str) -> None:
+def test_process_metrics_are_included(url: str) -> None:
     assert value(samples(url), "process_resident_memory_bytes") > 1e6

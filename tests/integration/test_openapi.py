@@ -1,4 +1,4 @@
-"""The REST API keeps what its OpenAPI document promises, whatever comes in: requests made up from that document."""
+"""The REST API conforms to its OpenAPI document: requests are generated from that document."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ CHECKS = [
 DOCUMENT = schemathesis.openapi.from_dict(create_app(None, Settings(), draw_lanes).openapi())
 OPERATIONS = {result.ok().label: result.ok() for result in DOCUMENT.get_all_operations()}
 DETECT = "POST /v1/detect"
-MADE_UP = [(label, GenerationMode.POSITIVE) for label in OPERATIONS] + [(DETECT, GenerationMode.NEGATIVE)]
+GENERATED = [(label, GenerationMode.POSITIVE) for label in OPERATIONS] + [(DETECT, GenerationMode.NEGATIVE)]
 BODIES = [
     *(fakes.image_file(kind) for kind in (".jpg", ".png", ".webp")),
     fakes.image_file()[:900],
     fakes.image_file(".png", 8000, 1200, 0),
     b"no image",
 ]
-ACCEPTED = [
+ACCEPT_HEADERS = [
     "application/json",
     "image/png",
     "image/*;q=0.5, text/html",
@@ -46,7 +46,7 @@ ACCEPTED = [
 exhaustive = settings(max_examples=60, derandomize=True, deadline=None, database=None)
 
 
-def test_the_document_tells_of_every_request() -> None:
+def test_the_document_describes_every_request() -> None:
     assert OPERATIONS.keys() >= {
         DETECT,
         "GET /v1/models",
@@ -58,30 +58,28 @@ def test_the_document_tells_of_every_request() -> None:
     }
 
 
-@pytest.mark.parametrize(("label", "mode"), MADE_UP)
+@pytest.mark.parametrize(("label", "mode"), GENERATED)
 @given(data=st.data())
 @exhaustive
-def test_every_answer_is_one_that_is_promised(
-    both_url: str, label: str, mode: GenerationMode, data: st.DataObject
-) -> None:
+def test_every_response_is_documented(both_url: str, label: str, mode: GenerationMode, data: st.DataObject) -> None:
     case = data.draw(OPERATIONS[label].as_strategy(generation_mode=mode))
     case.call_and_validate(
         base_url=both_url, checks=[*CHECKS, checks.negative_data_rejection, checks.unsupported_method]
     )
 
 
-def test_so_is_every_answer_to_an_image(both_url: str) -> None:
+def test_every_response_to_an_image_is_documented(both_url: str) -> None:
     statuses: set[int] = set()
 
-    @given(data=st.data(), body=st.sampled_from(BODIES), accept=st.sampled_from(ACCEPTED))
+    @given(data=st.data(), body=st.sampled_from(BODIES), accept=st.sampled_from(ACCEPT_HEADERS))
     @exhaustive
     def detect(data: st.DataObject, body: bytes, accept: str) -> None:
         case = data.draw(OPERATIONS[DETECT].as_strategy(generation_mode=GenerationMode.POSITIVE))
         case.media_type, case.body = "image/jpeg", body
         case.headers["accept"] = accept
-        answer = case.call(base_url=both_url)
-        statuses.add(answer.status_code)
-        case.validate_response(answer, checks=CHECKS)
+        response = case.call(base_url=both_url)
+        statuses.add(response.status_code)
+        case.validate_response(response, checks=CHECKS)
 
     detect()
     assert statuses >= {200, 406, 413, 415, 422}

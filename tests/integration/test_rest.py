@@ -17,19 +17,20 @@ from lanestream.protocol import LanesMessage, parse_server_message
 Serve = Callable[..., str]
 
 
-def detect(url: str, content: bytes | Iterator[bytes], **more: object) -> httpx.Response:
-    return httpx.post(f"{url}/v1/detect", content=content, **more)
+def detect(url: str, content: bytes | Iterator[bytes], **options: object) -> httpx.Response:
+    return httpx.post(f"{url}/v1/detect", content=content, **options)
 
 
 def problem(response: httpx.Response) -> tuple[int, str]:
-    told = response.json()
-    assert set(told) == {"code", "message", "hint"}
-    assert "\n" not in told["message"]
-    return response.status_code, told["code"]
+    """Returns the status and code of an error response."""
+    body = response.json()
+    assert set(body) == {"code", "message", "hint"}
+    assert "\n" not in body["message"]
+    return response.status_code, body["code"]
 
 
 @pytest.mark.parametrize("kind", [".jpg", ".png", ".webp"])
-def test_an_image_gives_its_lanes(url: str, kind: str) -> None:
+def test_lanes_of_an_image(url: str, kind: str) -> None:
     response = detect(url, fakes.image_file(kind))
     lanes = parse_server_message(response.text)
     assert isinstance(lanes, LanesMessage)
@@ -37,11 +38,11 @@ def test_an_image_gives_its_lanes(url: str, kind: str) -> None:
     assert [lane.position for lane in lanes.lanes] == [-1, 1]
     stages = lanes.timing_ms
     assert stages.total == pytest.approx(
-        stages.decode + stages.propose + stages.queue + stages.infer + stages.track, abs=0.01
+        stages.decode + stages.propose + stages.queue + stages.infer + stages.fit + stages.track, abs=0.01
     )
 
 
-def test_a_form_with_a_file_is_the_same(url: str) -> None:
+def test_an_image_can_be_sent_as_a_form_file(url: str) -> None:
     response = httpx.post(f"{url}/v1/detect", files={"file": ("road.jpg", fakes.image_file())})
     assert response.json()["width"] == 320
 
@@ -56,31 +57,31 @@ def test_a_form_with_a_file_is_the_same(url: str) -> None:
         ({"files": {"file": ("road.jpg", b"x" * 300_000)}}, 413),
     ],
 )
-def test_a_form_without_a_good_file_is_refused(url: str, sent: dict[str, object], status: int) -> None:
+def test_a_form_without_a_valid_file_is_refused(url: str, sent: dict[str, object], status: int) -> None:
     assert problem(httpx.post(f"{url}/v1/detect", **sent))[0] == status
 
 
 @pytest.mark.parametrize(
     ("accept", "kind"), [("image/png", b"\x89PNG"), ("image/*", b"\xff\xd8"), ("image/jpeg", b"\xff\xd8")]
 )
-def test_a_picture_can_be_had(url: str, accept: str, kind: bytes) -> None:
+def test_lanes_are_drawn_on_request(url: str, accept: str, kind: bytes) -> None:
     response = detect(url, fakes.image_file(), headers={"accept": accept})
     assert response.content.startswith(kind)
     picture = cv2.imdecode(np.frombuffer(response.content, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     assert picture.shape == (180, 320, 3)
-    assert picture.std(axis=2).max() > 10, "the lanes are in colour, the image is grey"
+    assert picture.std(axis=2).max() > 10, "the lanes are colored, the image is gray"
 
 
-def test_another_form_can_not(url: str) -> None:
-    for asked in ("text/html", "x" * 30_000):
-        refused = detect(url, fakes.image_file(), headers={"accept": asked})
+def test_other_media_types_are_refused(url: str) -> None:
+    for accept in ("text/html", "x" * 30_000):
+        refused = detect(url, fakes.image_file(), headers={"accept": accept})
         assert problem(refused) == (406, "not_acceptable")
         assert len(refused.text) < 400
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "expected"),
     [
         (b"", (415, "bad_image")),
         (b"hello, is this a road?", (415, "bad_image")),
@@ -90,8 +91,8 @@ def test_another_form_can_not(url: str) -> None:
         (bytes(300_000), (413, "image_too_large")),
     ],
 )
-def test_bad_images_are_told_why(url: str, data: bytes, told: tuple[int, str]) -> None:
-    assert problem(detect(url, data)) == told
+def test_invalid_images_are_refused_with_a_reason(url: str, data: bytes, expected: tuple[int, str]) -> None:
+    assert problem(detect(url, data)) == expected
 
 
 def test_a_body_of_unknown_length_is_not_read_beyond_the_limit(url: str) -> None:
@@ -99,7 +100,7 @@ def test_a_body_of_unknown_length_is_not_read_beyond_the_limit(url: str) -> None
         while True:
             yield bytes(50_000)
 
-    # The service answers and closes; whether the answer is still read then is the kernel's choice.
+    # The service responds and closes the connection; the response may be lost while the client is still sending.
     with suppress(httpx.WriteError, httpx.ReadError, httpx.RemoteProtocolError):
         assert problem(detect(url, endless())) == (413, "image_too_large")
 
@@ -114,12 +115,12 @@ def test_a_horizon_is_used(url: str) -> None:
 
 
 @pytest.mark.parametrize(("query", "positions"), [("", [-1, 1]), ("candidates", [-1, 1]), ("regression", [-1])])
-def test_the_detector_is_the_one_that_was_asked_for(both_url: str, query: str, positions: list[int]) -> None:
+def test_the_requested_detector_is_used(both_url: str, query: str, positions: list[int]) -> None:
     response = detect(both_url, fakes.image_file(), params={"detector": query} if query else None)
     assert [lane["position"] for lane in response.json()["lanes"]] == positions
 
 
-def test_a_detector_that_can_not_be_had_is_refused(url: str) -> None:
+def test_a_detector_that_is_not_loaded_is_refused(url: str) -> None:
     absent = detect(url, fakes.image_file(), params={"detector": "regression"})
     assert problem(absent) == (422, "no_detector")
     assert absent.json()["hint"] == "ask for candidates"
@@ -128,23 +129,23 @@ def test_a_detector_that_can_not_be_had_is_refused(url: str) -> None:
     assert "'candidates' or 'regression'" in unknown.json()["message"]
 
 
-def test_an_error_of_our_own_is_no_traceback(url: str) -> None:
+def test_unexpected_errors_reveal_no_details(url: str) -> None:
     response = detect(url, fakes.image_file(shade=255))
     assert problem(response) == (500, "internal")
     assert "mistake" not in response.text
 
 
-def test_unknown_paths_and_methods_are_told_alike(url: str) -> None:
+def test_unknown_paths_and_methods_are_refused_with_a_problem(url: str) -> None:
     assert problem(httpx.get(f"{url}/nothing")) == (404, "not_found")
-    odd = httpx.get(f"{url}/no%0athing/{'x' * 5000}")
-    assert problem(odd) == (404, "not_found")
-    assert len(odd.text) < 400
+    long = httpx.get(f"{url}/no%0athing/{'x' * 5000}")
+    assert problem(long) == (404, "not_found")
+    assert len(long.text) < 400
     refused = httpx.get(f"{url}/v1/detect")
     assert problem(refused) == (405, "method_not_allowed")
     assert refused.headers["allow"] == "POST"
 
 
-def test_what_runs_is_told(url: str) -> None:
+def test_the_loaded_network_is_reported(url: str) -> None:
     network = {"name": "fake 1", "detector": "candidates", "provider": "cpu"}
     assert httpx.get(f"{url}/v1/models").json() == {
         "models": [{**network, "sha256": "fa4e", "metadata": {"kind": "fake"}}]
@@ -153,15 +154,18 @@ def test_what_runs_is_told(url: str) -> None:
     assert httpx.get(f"{url}/readyz").json() == {"status": "ready", "provider": "cpu", "networks": [network]}
 
 
-def test_every_network_is_told_the_default_first(both_url: str) -> None:
+def test_all_networks_are_reported_the_default_first(both_url: str) -> None:
     models = httpx.get(f"{both_url}/v1/models").json()["models"]
     ready = httpx.get(f"{both_url}/readyz").json()["networks"]
-    for told in (models, ready):
-        assert [(one["detector"], one["name"]) for one in told] == [("candidates", "fake 1"), ("regression", "other 2")]
+    for entries in (models, ready):
+        assert [(entry["detector"], entry["name"]) for entry in entries] == [
+            ("candidates", "fake 1"),
+            ("regression", "other 2"),
+        ]
     assert models[1]["metadata"] == {"kind": "other fake"}
 
 
-def test_the_schemas_and_the_documentation_are_there(url: str) -> None:
+def test_schemas_and_documentation_are_available(url: str) -> None:
     schemas = httpx.get(f"{url}/v1/schema").json()
     assert "LanesMessage" in schemas["server"]["$defs"]
     detectors = schemas["client"]["$defs"]["StartMessage"]["properties"]["detector"]["anyOf"]
@@ -172,11 +176,11 @@ def test_the_schemas_and_the_documentation_are_there(url: str) -> None:
 
 def test_single_images_count_as_sessions(serve: Serve) -> None:
     network = fakes.GatedNetwork()
-    place = serve(fakes.engine(network), max_sessions=1)
-    with ThreadPoolExecutor(1) as other:
-        first = other.submit(detect, place, fakes.image_file())
+    url = serve(fakes.engine(network), max_sessions=1)
+    with ThreadPoolExecutor(1) as executor:
+        first = executor.submit(detect, url, fakes.image_file())
         network.wait_for_a_frame()
-        refused = detect(place, fakes.image_file())
+        refused = detect(url, fakes.image_file())
         network.let_through(1)
         assert problem(refused) == (503, "busy")
         assert first.result().status_code == 200

@@ -11,9 +11,9 @@ from typing import Any
 
 import fakes
 import pytest
-from talking import all_released, all_was_read, closed, heard, stream, tell
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from wsclient import receive, receive_close, send_message, stream, wait_until_read, wait_until_released
 
 from lanestream.detection import Pipeline
 from lanestream.engine import Engine
@@ -28,22 +28,24 @@ def test_the_five_lines_of_the_readme(url: str, tmp_path: Path, capsys: pytest.C
     assert len([line for line in code.splitlines() if line]) <= 5
     code = code.replace("ws://127.0.0.1:8000", url.replace("http", "ws")).replace("road.jpg", f"{tmp_path}/road.jpg")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)  # five lines leave closing the file to Python
+        warnings.simplefilter("ignore", ResourceWarning)  # the five lines do not close the file
         exec(code, {})  # noqa: S102
     assert [lane["position"] for lane in json.loads(capsys.readouterr().out)["lanes"]] == [-1, 1]
 
 
-@pytest.mark.parametrize(("offered", "agreed"), [(None, None), (["lanestream.v1"], "lanestream.v1"), (["other"], None)])
-def test_the_subprotocol_is_agreed_on_where_it_is_offered(url: str, offered: Any, agreed: str | None) -> None:
+@pytest.mark.parametrize(
+    ("offered", "selected"), [(None, None), (["lanestream.v1"], "lanestream.v1"), (["other"], None)]
+)
+def test_the_subprotocol_is_selected_if_it_is_offered(url: str, offered: Any, selected: str | None) -> None:
     with connect(f"{url.replace('http', 'ws')}/v1/stream", subprotocols=offered) as socket:
-        assert socket.subprotocol == agreed
-        assert socket.protocol.extensions == [], "deflate was offered and must be declined"
+        assert socket.subprotocol == selected
+        assert socket.protocol.extensions == [], "compression is offered and must be declined"
 
 
-def test_start_is_answered_with_what_runs_and_what_is_accepted(url: str) -> None:
+def test_ready_reports_the_network_and_the_limits(url: str) -> None:
     with stream(url) as socket:
-        tell(socket, "start", mode="all")
-        ready = heard(socket)
+        send_message(socket, "start", mode="all")
+        ready = receive(socket)
     assert len(ready.pop("session")) == 16
     assert len(ready.pop("resume_token")) >= 32
     assert ready == {
@@ -67,39 +69,39 @@ def test_start_is_answered_with_what_runs_and_what_is_accepted(url: str) -> None
     }
 
 
-def test_numbers_and_times_are_the_clients_where_it_gives_them(url: str) -> None:
+def test_missing_numbers_and_times_are_assigned(url: str) -> None:
     with stream(url, mode="all") as socket:
         for announced in ({}, {"seq": 7, "timestamp": 3.5}, {"timestamp": -2.0}, {"seq": 3}):
             if announced:
-                tell(socket, "frame", **announced)
+                send_message(socket, "frame", **announced)
             socket.send(fakes.image_file())
-        answers = [heard(socket) for _ in range(4)]
+        answers = [receive(socket) for _ in range(4)]
     assert [answer["seq"] for answer in answers] == [0, 7, 8, 3]
     assert [answer["timestamp"] for answer in answers[1:3]] == [3.5, -2.0]
     assert all(0.0 <= answers[i]["timestamp"] < 60.0 for i in (0, 3)), "seconds since the stream was opened"
 
 
-def test_end_answers_what_is_held_then_sums_up_and_closes(serve: Serve) -> None:
+def test_end_answers_the_frames_held_then_sends_the_summary_and_closes(serve: Serve) -> None:
     network = fakes.GatedNetwork()
     with stream(serve(fakes.engine(network)), mode="all") as socket:
         for _ in range(3):
             socket.send(fakes.image_file())
         socket.send(b"no image")
-        tell(socket, "end")
-        all_was_read(socket)
+        send_message(socket, "end")
+        wait_until_read(socket)
         network.let_through(3)
-        assert [heard(socket)["seq"] for _ in range(4)] == [0, 1, 2, 3]
-        summary = heard(socket)
+        assert [receive(socket)["seq"] for _ in range(4)] == [0, 1, 2, 3]
+        summary = receive(socket)
         assert summary.pop("duration_s") >= 0.0
         assert summary == {"type": "summary", "frames": 4, "answered": 3, "failed": 1, "dropped": 0}
-        assert closed(socket) == (1000, "")
+        assert receive_close(socket) == (1000, "")
 
 
-def test_an_end_without_a_frame_is_fine(url: str) -> None:
+def test_a_stream_may_end_without_a_frame(url: str) -> None:
     with stream(url) as socket:
-        tell(socket, "end")
-        assert heard(socket)["frames"] == 0
-        assert closed(socket)[0] == 1000
+        send_message(socket, "end")
+        assert receive(socket)["frames"] == 0
+        assert receive_close(socket)[0] == 1000
 
 
 BAD_FRAMES = [
@@ -114,14 +116,14 @@ BAD_FRAMES = [
 BAD_CODES = ["bad_image"] * 5 + ["image_too_large", "internal"]
 
 
-def test_a_bad_frame_costs_that_frame(url: str) -> None:
+def test_an_invalid_frame_affects_no_other_frame(url: str) -> None:
     with stream(url, mode="all") as socket:
         for seq, (data, code) in enumerate(zip(BAD_FRAMES, BAD_CODES, strict=True)):
             socket.send(data)
-            told = heard(socket)
-            assert (told["type"], told["seq"], told["code"], told["fatal"]) == ("error", seq, code, False)
+            error = receive(socket)
+            assert (error["type"], error["seq"], error["code"], error["fatal"]) == ("error", seq, code, False)
         socket.send(fakes.image_file())
-        assert heard(socket)["seq"] == len(BAD_FRAMES)
+        assert receive(socket)["seq"] == len(BAD_FRAMES)
 
 
 BAD_TEXTS = [
@@ -146,21 +148,21 @@ BAD_TEXTS = [
 ]
 
 
-def test_a_bad_text_is_told_and_costs_nothing(url: str) -> None:
+def test_an_invalid_text_message_is_reported_and_has_no_effect(url: str) -> None:
     with stream(url) as socket:
         for text in BAD_TEXTS:
             socket.send(text)
-            told = heard(socket)
-            assert (told["type"], told["code"], told["fatal"]) == ("error", "bad_message", False)
-            assert told["message"]
-            assert "\n" not in told["message"]
-            assert len(told["message"]) < 400, "what was sent is not sent back"
+            error = receive(socket)
+            assert (error["type"], error["code"], error["fatal"]) == ("error", "bad_message", False)
+            assert error["message"]
+            assert "\n" not in error["message"]
+            assert len(error["message"]) < 400, "the invalid message is not quoted in full"
         socket.send(fakes.image_file())
-        assert heard(socket)["seq"] == 0
+        assert receive(socket)["seq"] == 0
 
 
 @pytest.mark.parametrize(
-    ("asked", "told", "positions"),
+    ("start", "expected", "positions"),
     [
         ({}, ("candidates", "fake 1"), [-1, 1]),
         ({"detector": "candidates"}, ("candidates", "fake 1"), [-1, 1]),
@@ -168,69 +170,69 @@ def test_a_bad_text_is_told_and_costs_nothing(url: str) -> None:
         ({"detector": "regression"}, ("regression", "other 2"), [-1]),
     ],
 )
-def test_the_detector_is_the_one_that_was_asked_for(
-    both_url: str, asked: dict[str, Any], told: tuple[str, str], positions: list[int]
+def test_the_requested_detector_is_used(
+    both_url: str, start: dict[str, Any], expected: tuple[str, str], positions: list[int]
 ) -> None:
     with stream(both_url) as socket:
-        tell(socket, "start", mode="all", **asked)
-        ready = heard(socket)
-        assert (ready["detector"], ready["model"]) == told
+        send_message(socket, "start", mode="all", **start)
+        ready = receive(socket)
+        assert (ready["detector"], ready["model"]) == expected
         socket.send(fakes.image_file())
-        assert [lane["position"] for lane in heard(socket)["lanes"]] == positions
+        assert [lane["position"] for lane in receive(socket)["lanes"]] == positions
 
 
-def test_a_detector_that_is_not_there_is_told_and_costs_nothing(url: str) -> None:
+def test_a_detector_that_is_not_loaded_is_reported_and_has_no_effect(url: str) -> None:
     with stream(url) as socket:
-        tell(socket, "start", mode="all", detector="regression")
-        refused = heard(socket)
+        send_message(socket, "start", mode="all", detector="regression")
+        refused = receive(socket)
         assert (refused["type"], refused["code"], refused["fatal"]) == ("error", "no_detector", False)
         assert (refused["message"], refused["hint"]) == ("there is no detector regression here", "ask for candidates")
-        tell(socket, "start", mode="all", detector="candidates")
-        assert heard(socket)["type"] == "ready"
-        tell(socket, "start", detector="regression")
+        send_message(socket, "start", mode="all", detector="candidates")
+        assert receive(socket)["type"] == "ready"
+        send_message(socket, "start", detector="regression")
         socket.send(fakes.image_file())
-        assert [heard(socket)[key] for key in ("code", "seq")] == ["no_detector", 0]
+        assert [receive(socket)[key] for key in ("code", "seq")] == ["no_detector", 0]
     with stream(url) as socket:
-        tell(socket, "start", detector="regression")
+        send_message(socket, "start", detector="regression")
         socket.send(fakes.image_file())
-        assert heard(socket)["code"] == "no_detector"
-        assert len(heard(socket)["lanes"]) == 2, "a first frame opens the stream with the defaults"
+        assert receive(socket)["code"] == "no_detector"
+        assert len(receive(socket)["lanes"]) == 2, "a first image opens the stream with the defaults"
 
 
 def test_the_only_detector_is_the_default(serve: Serve) -> None:
     only = Engine([Pipeline("regression", fakes.LeftDetector(), fakes.OtherNetwork())])
     with stream(serve(only)) as socket:
-        tell(socket, "start", detector="candidates")
-        assert heard(socket)["hint"] == "ask for regression"
-        tell(socket, "start")
-        assert heard(socket)["detector"] == "regression"
+        send_message(socket, "start", detector="candidates")
+        assert receive(socket)["hint"] == "ask for regression"
+        send_message(socket, "start")
+        assert receive(socket)["detector"] == "regression"
 
 
-def test_a_message_out_of_place_is_told(serve: Serve) -> None:
+def test_a_message_that_is_not_allowed_is_reported(serve: Serve) -> None:
     network = fakes.GatedNetwork()
     with stream(serve(fakes.engine(network))) as socket:
         socket.send(fakes.image_file())
-        tell(socket, "start")
-        assert "open already" in heard(socket)["message"]
-        tell(socket, "end")
-        tell(socket, "end")
-        assert "after `end`" in heard(socket)["message"]
+        send_message(socket, "start")
+        assert "already open" in receive(socket)["message"]
+        send_message(socket, "end")
+        send_message(socket, "end")
+        assert "after `end`" in receive(socket)["message"]
         socket.send(fakes.image_file())
-        assert "after `end`" in heard(socket)["message"]
+        assert "after `end`" in receive(socket)["message"]
         network.let_through()
-        assert heard(socket)["type"] == "lanes"
-        assert heard(socket)["frames"] == 1
+        assert receive(socket)["type"] == "lanes"
+        assert receive(socket)["frames"] == 1
 
 
-def test_an_over_run_in_mode_all_ends_the_stream(serve: Serve) -> None:
+def test_an_overrun_in_mode_all_ends_the_stream(serve: Serve) -> None:
     network = fakes.GatedNetwork()
     with stream(serve(fakes.engine(network), credits=2), mode="all") as socket:
         for _ in range(3):
             socket.send(fakes.image_file())
-        told = heard(socket)
+        error = receive(socket)
         network.let_through()
-        assert (told["type"], told["code"], told["fatal"]) == ("error", "overrun", True)
-        assert closed(socket) == (1008, told["message"])
+        assert (error["type"], error["code"], error["fatal"]) == ("error", "overrun", True)
+        assert receive_close(socket) == (1008, error["message"])
 
 
 def test_an_answer_renews_the_credit(serve: Serve) -> None:
@@ -239,7 +241,7 @@ def test_an_answer_renews_the_credit(serve: Serve) -> None:
         network.let_through(50)
         for seq in range(50):
             socket.send(fakes.image_file())
-            assert heard(socket)["seq"] == seq
+            assert receive(socket)["seq"] == seq
 
 
 def test_newer_frames_replace_waiting_ones_in_mode_latest(serve: Serve) -> None:
@@ -249,12 +251,12 @@ def test_newer_frames_replace_waiting_ones_in_mode_latest(serve: Serve) -> None:
         network.wait_for_a_frame()
         for _ in range(5):
             socket.send(fakes.image_file())
-        all_was_read(socket)
+        wait_until_read(socket)
         network.let_through(2)
-        answers = [heard(socket) for _ in range(2)]
+        answers = [receive(socket) for _ in range(2)]
         assert [(answer["seq"], answer["dropped"]) for answer in answers] == [(0, 4), (5, 4)]
-        tell(socket, "end")
-        assert heard(socket)["dropped"] == 4
+        send_message(socket, "end")
+        assert receive(socket)["dropped"] == 4
 
 
 def test_pings_are_answered_while_the_network_runs(serve: Serve) -> None:
@@ -267,82 +269,82 @@ def test_pings_are_answered_while_the_network_runs(serve: Serve) -> None:
         network.let_through(2)
 
 
-def test_an_image_of_too_many_bytes_costs_itself_and_one_far_beyond_them_the_socket(url: str) -> None:
+def test_an_image_above_the_size_limit_fails_and_a_far_larger_one_closes_the_socket(url: str) -> None:
     with stream(url, mode="all") as socket:
         socket.send(bytes(200_001))
-        told = heard(socket)
-        assert (told["code"], told["seq"], told["fatal"]) == ("image_too_large", 0, False)
+        error = receive(socket)
+        assert (error["code"], error["seq"], error["fatal"]) == ("image_too_large", 0, False)
         socket.send(fakes.image_file())
-        assert heard(socket)["seq"] == 1
+        assert receive(socket)["seq"] == 1
         socket.send(bytes(400_001))
-        assert closed(socket)[0] == 1009
+        assert receive_close(socket)[0] == 1009
 
 
-def test_an_image_may_come_in_pieces(url: str) -> None:
+def test_an_image_may_be_fragmented(url: str) -> None:
     image = fakes.image_file()
     with stream(url, mode="all") as socket:
         socket.send([image[:100], b"", image[100:200], image[200:]])
-        assert heard(socket)["type"] == "lanes"
+        assert receive(socket)["type"] == "lanes"
 
 
-def test_a_text_that_is_none_ends_the_stream(url: str) -> None:
+def test_a_text_message_that_is_not_utf_8_ends_the_stream(url: str) -> None:
     with stream(url, mode="all") as socket:
         socket.send(b"\xff\xfe", text=True)
-        assert closed(socket)[0] == 1007
+        assert receive_close(socket)[0] == 1007
 
 
-def test_a_stream_beyond_the_limit_is_refused_until_one_ends(serve: Serve) -> None:
-    place = serve(fakes.engine(), max_sessions=1)
-    with stream(place, mode="all") as first:
-        with stream(place) as second:
+def test_a_stream_above_the_limit_is_refused_until_another_ends(serve: Serve) -> None:
+    url = serve(fakes.engine(), max_sessions=1)
+    with stream(url, mode="all") as first:
+        with stream(url) as second:
             second.send(fakes.image_file())
-            told = heard(second)
-            assert (told["code"], told["fatal"]) == ("busy", True)
-            assert closed(second)[0] == 1013
-        tell(first, "end")
-        assert heard(first)["type"] == "summary"
-        with stream(place, mode="all"):
+            error = receive(second)
+            assert (error["code"], error["fatal"]) == ("busy", True)
+            assert receive_close(second)[0] == 1013
+        send_message(first, "end")
+        assert receive(first)["type"] == "summary"
+        with stream(url, mode="all"):
             pass
 
 
-def test_a_client_that_goes_away_in_the_middle_of_a_frame_frees_its_place(serve: Serve) -> None:
+def test_a_client_that_disconnects_during_a_frame_releases_its_session(serve: Serve) -> None:
     network = fakes.GatedNetwork()
-    place = serve(fakes.engine(network), max_sessions=1)
-    with stream(place, mode="all") as socket:
+    url = serve(fakes.engine(network), max_sessions=1)
+    with stream(url, mode="all") as socket:
         socket.send(fakes.image_file())
         network.wait_for_a_frame()
     network.let_through(2)
-    all_released(place)
-    with stream(place) as next_one:
-        next_one.send(fakes.image_file())
-        assert heard(next_one)["type"] == "lanes"
+    wait_until_released(url)
+    with stream(url) as second:
+        second.send(fakes.image_file())
+        assert receive(second)["type"] == "lanes"
 
 
-def test_a_stream_before_the_network_is_loaded_is_told_to_come_again(serve: Serve) -> None:
+def test_a_stream_is_refused_while_the_network_is_being_loaded(serve: Serve) -> None:
     with pytest.raises(InvalidStatus) as refused, stream(serve()):
         pass
     assert refused.value.response.status_code == 503
     assert json.loads(refused.value.response.body)["code"] == "not_ready"
 
 
-def test_streams_with_different_detectors_run_at_the_same_time(both_url: str) -> None:
+def test_streams_with_different_detectors_run_concurrently(both_url: str) -> None:
     with stream(both_url, mode="all") as one, stream(both_url, mode="all", detector="regression") as other:
         for seq in range(6):
             one.send(fakes.image_file())
             other.send(fakes.image_file())
             for socket, tracks in ((one, [1, 2]), (other, [1])):
-                answer = heard(socket)
+                answer = receive(socket)
                 assert answer["seq"] == seq
                 assert [lane["track_id"] for lane in answer["lanes"]] == tracks
 
 
-def test_streams_know_nothing_of_each_other(url: str) -> None:
+def test_streams_do_not_affect_each_other(url: str) -> None:
     small, large = fakes.image_file(), fakes.image_file(width=640, height=360)
     with stream(url, mode="all") as one, stream(url, mode="all", horizon=0.3) as other:
         for seq in range(6):
             one.send(small)
             other.send(large)
             for socket, width, horizon in ((one, 320, 0.4 * 180), (other, 640, 0.3 * 360)):
-                answer = heard(socket)
+                answer = receive(socket)
                 assert (answer["seq"], answer["width"], answer["horizon"]) == (seq, width, horizon)
                 assert [lane["track_id"] for lane in answer["lanes"]] == [1, 2]

@@ -1,4 +1,4 @@
-"""Streams of clients that do anything at all: all is answered in the words of the protocol, nothing gets lost."""
+"""Streams of clients that send anything: every reply is a valid message, and every frame is accounted for."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import bombs
 import fakes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from talking import heard, stream
 from websockets.exceptions import ConnectionClosed
+from wsclient import receive, stream
 
 from lanestream.errors import ProtocolError
 from lanestream.protocol import (
@@ -29,7 +29,7 @@ Sent = str | bytes
 IMAGE = fakes.image_file()
 POISONED = fakes.image_file(shade=255)  # the fake detector fails at it
 TOO_LARGE = bytes(200_001)  # for the server of `url`
-# What a client can be told, whatever it does to a service in order; `internal` only of poisoned frames.
+# The errors that a client can provoke in a working service; `internal` only with poisoned frames.
 CODES = {"bad_message", "bad_image", "image_too_large", "no_detector", "overrun", "internal"}
 
 numbers = st.one_of(
@@ -61,10 +61,12 @@ messages = starts | frames
 names = st.sampled_from(
     ["type", "mode", "seq", "timestamp", "horizon", "camera", "session", "resume_token", "detector", "else"]
 )
-spoiled = st.builds(lambda message, name, value: {**message, name: value}, messages, names | st.text(max_size=9), junk)
+corrupted = st.builds(
+    lambda message, name, value: {**message, name: value}, messages, names | st.text(max_size=9), junk
+)
 texts = st.one_of(
     messages.map(json.dumps),
-    spoiled.map(json.dumps),
+    corrupted.map(json.dumps),
     junk.map(json.dumps),
     st.text(max_size=20),
     st.sampled_from(["{" * 5000, '{"type": "frame", "seq": ' + "9" * 5000 + "}", '{"type": "end", "type": "start"}']),
@@ -79,20 +81,20 @@ images = st.one_of(
 
 
 @dataclass
-class Heard:
-    """What came back over a stream, and the code that it was closed with; 0 where it was just dropped."""
+class Received:
+    """The messages received over a stream, and its close code; 0 without one."""
 
-    told: list[ServerMessage] = field(default_factory=list)
+    messages: list[ServerMessage] = field(default_factory=list)
     code: int = 0
 
     @property
     def errors(self) -> list[ErrorMessage]:
-        return [message for message in self.told if isinstance(message, ErrorMessage)]
+        return [message for message in self.messages if isinstance(message, ErrorMessage)]
 
 
-def talk(url: str, sent: Sequence[Sent]) -> Heard:
-    """Sends all of it at once, as far as the service wants it, and listens until the stream is closed."""
-    listened = Heard()
+def exchange(url: str, sent: Sequence[Sent]) -> Received:
+    """Sends all messages, as far as the service reads them, and receives until the stream is closed."""
+    received = Received()
     with stream(url) as socket:
         try:
             for message in sent:
@@ -103,10 +105,10 @@ def talk(url: str, sent: Sequence[Sent]) -> Heard:
             while True:
                 text = socket.recv(fakes.WAIT_S)
                 assert isinstance(text, str)
-                listened.told.append(parse_server_message(text))
+                received.messages.append(parse_server_message(text))
         except ConnectionClosed as closed:
-            listened.code = 0 if closed.rcvd is None else closed.rcvd.code
-    return listened
+            received.code = 0 if closed.rcvd is None else closed.rcvd.code
+    return received
 
 
 def is_end(message: Sent) -> bool:
@@ -118,32 +120,32 @@ def is_end(message: Sent) -> bool:
 
 @given(before=st.lists(texts | images | images, max_size=14), after=st.lists(texts | images, max_size=2))
 @settings(max_examples=120, derandomize=True, deadline=None, database=None)
-def test_whatever_a_client_does_is_answered_and_counted(url: str, before: list[Sent], after: list[Sent]) -> None:
+def test_any_sequence_of_messages_is_answered_and_counted(url: str, before: list[Sent], after: list[Sent]) -> None:
     sent = [*before, '{"type": "end"}', *after]
     counted = sent[: next(at for at, message in enumerate(sent) if is_end(message))]
     frames = [message for message in counted if isinstance(message, bytes)]
-    listened = talk(url, sent)
-    errors = listened.errors
+    received = exchange(url, sent)
+    errors = received.errors
 
     assert {error.code for error in errors} <= CODES
     assert sum(error.code == "internal" for error in errors) <= frames.count(POISONED)
     assert all(error.message and "\n" not in error.message + error.hint for error in errors)
-    if listened.code == 1000:
-        check_count(listened, frames)
+    if received.code == 1000:
+        check_count(received, frames)
     else:
-        assert (listened.code, errors[-1].code, errors[-1].fatal) == (1008, "overrun", True)
+        assert (received.code, errors[-1].code, errors[-1].fatal) == (1008, "overrun", True)
         assert len(frames) > 8
     with stream(url) as fresh:
         fresh.send(IMAGE)
-        assert [lane["position"] for lane in heard(fresh)["lanes"]] == [-1, 1]
+        assert [lane["position"] for lane in receive(fresh)["lanes"]] == [-1, 1]
 
 
-def check_count(listened: Heard, frames: Sequence[bytes]) -> None:
-    """Every frame before the end is answered, failed with its number, or dropped."""
-    summary = listened.told[-1]
+def check_count(received: Received, frames: Sequence[bytes]) -> None:
+    """Checks that every frame before the end is answered, failed with its number, or dropped."""
+    summary = received.messages[-1]
     assert isinstance(summary, SummaryMessage)
-    answered = sum(isinstance(message, LanesMessage) for message in listened.told)
-    failed = sum(error.seq is not None for error in listened.errors)
+    answered = sum(isinstance(message, LanesMessage) for message in received.messages)
+    failed = sum(error.seq is not None for error in received.errors)
     assert (summary.frames, summary.answered, summary.failed) == (len(frames), answered, failed)
     assert summary.frames == summary.answered + summary.failed + summary.dropped
-    assert not [error for error in listened.errors if error.fatal]
+    assert not [error for error in received.errors if error.fatal]

@@ -12,7 +12,7 @@ import fakes
 import httpx
 import psutil
 from processes import service
-from talking import heard, stream, tell
+from wsclient import receive, send_message, stream
 
 CREDITS = 4
 
@@ -33,9 +33,9 @@ class Camera:
                 while self.sent < len(self.answers) + CREDITS and not self.stopped.is_set():
                     socket.send(self.picture)
                     self.sent += 1
-                self.answers.append(heard(socket))
-            tell(socket, "end")
-            assert heard(socket)["answered"] == sum(answer["type"] == "lanes" for answer in self.answers)
+                self.answers.append(receive(socket))
+            send_message(socket, "end")
+            assert receive(socket)["answered"] == sum(answer["type"] == "lanes" for answer in self.answers)
 
 
 def wait_for(what: Callable[[], bool]) -> None:

@@ -45,7 +45,7 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None
     cv2.setNumThreads(settings.opencv_threads)
     app = create_app(None, settings, draw)
     listener = listen(settings.host, settings.port)
-    server = Server(app, settings)
+    server = LanestreamServer(app, settings)
     with suppress(KeyboardInterrupt), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
         runner.run(_serve(server, listener, app, load))
 
@@ -57,7 +57,7 @@ def listen(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=family, backlog=_BACKLOG)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise SettingsError(f"port {port} on {host} is in use", "choose another port with --port") from None
+            raise SettingsError(f"port {port} on {host} is in use", "choose another with --port") from None
         reason = (error.strerror or str(error)).partition(" (")[0].lower()
         raise SettingsError(f"can't listen on {host}, port {port}: {reason}", "check --host and --port") from None
 
@@ -76,7 +76,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     )
 
 
-class Server(uvicorn.Server):
+class LanestreamServer(uvicorn.Server):
     """A uvicorn server that answers the frames it has accepted before it stops."""
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:

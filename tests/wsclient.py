@@ -1,4 +1,4 @@
-"""Raw WebSocket helpers for tests that send and receive single stream messages."""
+"""A minimal client of the stream, message by message."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from lanestream.protocol import parse_server_message
 
 @contextmanager
 def stream(url: str, **start: Any) -> Iterator[ClientConnection]:
-    """Connects a stream. Opens it with a `start` message if there are arguments for one."""
+    """Opens a stream; sends `start` if any of its fields are given."""
     with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
         if start:
-            tell(socket, "start", **start)
-            assert heard(socket)["type"] == "ready"
+            send_message(socket, "start", **start)
+            assert receive(socket)["type"] == "ready"
         yield socket
 
 
-def tell(socket: ClientConnection, kind: str, **fields: Any) -> None:
-    """Sends a message of type `kind`."""
+def send_message(socket: ClientConnection, kind: str, **fields: Any) -> None:
+    """Sends a text message of a type."""
     socket.send(json.dumps({"type": kind, **fields}))
 
 
-def heard(socket: ClientConnection) -> dict[str, Any]:
-    """Returns the next message, after checking it against the protocol."""
+def receive(socket: ClientConnection) -> dict[str, Any]:
+    """Returns the next message, which must be a valid one."""
     text = socket.recv(fakes.WAIT_S)
     assert isinstance(text, str)
     parse_server_message(text)
@@ -41,22 +41,22 @@ def heard(socket: ClientConnection) -> dict[str, Any]:
     return message
 
 
-def closed(socket: ClientConnection) -> tuple[int, str]:
-    """Returns the code and the reason with which the service closes. Fails if a message comes before."""
+def receive_close(socket: ClientConnection) -> tuple[int, str]:
+    """Returns the code and reason with which the service closes. Fails if a message comes first."""
     with pytest.raises(ConnectionClosed) as caught:
         socket.recv(fakes.WAIT_S)
     assert caught.value.rcvd is not None
     return caught.value.rcvd.code, caught.value.rcvd.reason
 
 
-def all_was_read(socket: ClientConnection) -> None:
-    """Waits until the service has read all earlier messages: it answers text immediately and in order."""
+def wait_until_read(socket: ClientConnection) -> None:
+    """Returns when the service has read all earlier messages, which it does in order."""
     socket.send("?")
-    assert heard(socket)["code"] == "bad_message"
+    assert receive(socket)["code"] == "bad_message"
 
 
-def all_released(url: str, **headers: str) -> None:
-    """Waits until no stream has a session: the service releases one only after its client has gone."""
+def wait_until_released(url: str, **headers: str) -> None:
+    """Returns when no stream has a session any more; a session is released after its client disconnects."""
     deadline = time.monotonic() + fakes.WAIT_S
     while "lane_sessions_active 0.0" not in httpx.get(f"{url}/metrics", headers=headers).text:
         assert time.monotonic() < deadline
