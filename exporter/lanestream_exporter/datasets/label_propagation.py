@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-
 from lanestream.detection.commonroad import CommonRoad
+
 from lanestream.detection.curve_fit import Refinement
 from lanestream.errors import LabelError
 from lanestream.road.curve import Curve, FloatArray

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lanestream.runtime import RuntimeOptions
+
 from lanestream.detection.ego_prior import EgoPriorEstimator
 from lanestream.engine import load_engine
 from lanestream.errors import ModelError
-from lanestream.runtime import RuntimeOptions
 
 _HINT = "give a regressor's ONNX file as the guide"
 
