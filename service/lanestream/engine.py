@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lanestream.detection.detectors import DETECTORS, ModelDescriptions
 from lanestream.detection.interface import Detector, ModelRole
 from lanestream.errors import ModelError, NoDetectorError
+from lanestream.host import keep_freed_memory
 from lanestream.inference.loaded_model import LoadedModel
 from lanestream.inference.loading import load_model
 from lanestream.inference.model_info import ClassifierInfo, RegressorInfo
@@ -97,6 +98,7 @@ def load_engine(
     out. A regressor as the `model` is the only detector. Raises ModelError for a file that cannot be served,
     ProviderError if `provider` cannot be used.
     """
+    keep_freed_memory()
     main = load_model(model or SHIPPED_MODEL, provider, options)
     models: dict[ModelRole, LoadedModel] = {main.info.kind: main}
     if main.info.kind == "classifier" and regressor is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -69,9 +70,10 @@ class CandidateDetector:
         prior = self.regressor.prior(output, view)
         # Tracked boundaries are on the paint already.
         curves = output.curves(view)
-        tracked = (context.tracked or Curves.none(view.horizon)).below(view.horizon, view.bottom)
-        is_new = ~are_duplicates(curves, tracked, view).any(axis=1)
-        _, fits = fit_output(gray, output, view, self.regressor.threshold, np.flatnonzero(is_new).tolist())
+        sides: Sequence[int] = (0, 1)
+        if context.tracked is not None:
+            sides = np.flatnonzero(~are_duplicates(curves, context.tracked, view).any(axis=1)).tolist()
+        _, fits = fit_output(gray, output, view, self.regressor.threshold, sides)
         return propose(gray, context, prior, fits.curves, limit)
 
     @staticmethod

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Final
 
 import cv2
@@ -45,7 +46,7 @@ _CANDIDATE_SIGMA: Final = np.array([0.03, 0.02, 0.1])
 
 # The vanishing point's column and the curvature term of a boundary are those of the road within these deviations, in
 # depths; on a curving road also within this share of its curvature, because the inner boundary curves more sharply.
-_COMMON_SIGMA: Final = (0.003, 0.0006)
+_COMMON_SIGMA: Final = np.array([0.003, 0.0006])
 _CURVING_SHARE: Final = 0.1
 # A boundary this many deviations from the common road counts half: it is part of another road, or not a boundary.
 _OUTLIER: Final = 3.0
@@ -180,6 +181,8 @@ class _JointFit:
         self._start = curves.x(self._rows)
         self._precision = sigma**-2.0
         self._row_precision = (_ROW_NOISE + _BLUR * strips.u) ** -2.0
+        self._scale = strips.u * strips.obliquity[:, None]
+        self._sigma_unit = view.depth * strips.obliquity[:, None]
         # Sums over a strip's cells, and sums of their positions, in one product.
         self._moments = np.stack([np.ones_like(strips.across), strips.across], axis=1)
         # The constraints' coefficients (2 N, 3 N + 3) of all shifts, V, H and C; those of H depend on the horizon.
@@ -189,108 +192,92 @@ class _JointFit:
         constraints[indices, 0, 3 * indices] = constraints[indices, 1, 3 * indices + 2] = 1.0
         constraints[:, 0, -3] = constraints[:, 1, -1] = -1.0
         self._constraints = constraints
+        # Where in the flat normal matrix the block of each boundary is, and the diagonal of the road.
+        size = 3 * number + 3
+        within = size * np.arange(3)[:, None] + np.arange(3)
+        self._blocks = (3 * (size + 1) * indices)[:, None, None] + within
+        self._road_diagonal = (size + 1) * np.arange(3 * number, size)
 
     def run(self, settings: FitSettings) -> Fits:
         depth, expected = self._view.depth, self._view.horizon
         number = len(self._start)
-        horizon = expected
-        columns = self._start
-        theta = columns @ np.linalg.inv(_basis((self._rows - horizon) / depth)).T
-        road: FloatArray = np.array([np.median(theta[:, 0]), 0.0, np.median(theta[:, 2])])
-        solution: FloatArray = np.zeros(3 * number + 3)
+        shifts = slice(0, 3 * number)
         road_sigma = _ROAD_SIGMA if settings.move_horizon else _ROAD_SIGMA * np.array([1.0, 1e-6, 1.0])
+        road_precision = (depth * road_sigma) ** -2.0
+        most_pitch = _MOST_PITCH * depth if settings.move_horizon else 0.0
+        horizon, columns = expected, self._start
+        basis = _basis((self._rows - horizon) / depth)
+        inverse: FloatArray = np.linalg.inv(basis)
+        theta = start = self._start @ inverse.T
+        road = np.array([_median(start[:, 0]), 0.0, _median(start[:, 2])])
         for reach in settings.rounds:
-            basis = _basis((self._rows - horizon) / depth)
-            inverse = np.linalg.inv(basis)
-            start = self._start @ inverse.T
             row_basis = _basis((self._strips.y - horizon) / depth)
-            information, moment = self._paint(row_basis, start, columns @ inverse.T, reach, horizon)
-            prior = np.einsum("ij,ni,ik->njk", basis, self._precision, basis)
-            known = np.array([np.median(start[:, 0]), expected - horizon, np.median(start[:, 2])])
-            constraints, weights = self._weighted_constraints(inverse, start, solution, road, horizon)
-            normal, right = self._normal_equations(prior + information, constraints, weights, known, road_sigma)
-            right[: 3 * number] += moment.ravel()
-            right -= constraints.T @ (weights * start[:, [0, 2]].ravel())
-            solution = np.asarray(np.linalg.solve(normal, right), float)
-            columns = self._start + solution[: 3 * number].reshape(-1, 3) @ basis.T
-            road = solution[-3:].copy()
-            moved = horizon + road[1] - expected if settings.move_horizon else 0.0
-            horizon = expected + float(np.clip(moved, -_MOST_PITCH * depth, _MOST_PITCH * depth))
-            # The shifts belong to the columns, and are expressed below the new horizon from now on.
-            solution[: 3 * number] = (
-                (columns - self._start) @ np.linalg.inv(_basis((self._rows - horizon) / depth)).T
-            ).ravel()
-            road[1] = 0.0
-        normal, _ = self._normal_equations(
-            prior + information / _CORRELATED_ROWS, constraints, weights, known, road_sigma
-        )
-        covariance = np.linalg.inv(normal)[: 3 * number, : 3 * number].reshape(number, 3, number, 3)
-        own: FloatArray = covariance[np.arange(number), :, np.arange(number), :]
+            information, moment = self._paint(row_basis, start, theta, reach, horizon)
+            prior = (basis.T * self._precision[:, None, :]) @ basis
+            known = np.array([_median(start[:, 0]), expected - horizon, _median(start[:, 2])])
+            constraints, weights = self._weighted_constraints(inverse, theta, road, horizon)
+            weighted = constraints.T * weights
+            normal = weighted @ constraints
+            normal.ravel()[self._blocks] += prior + information
+            normal.ravel()[self._road_diagonal] += road_precision
+            right = -(weighted @ start[:, ::2].ravel())
+            right[shifts] += moment.ravel()
+            right[-3:] += road_precision * known
+            solution = np.linalg.solve(normal, right)
+            columns = self._start + solution[shifts].reshape(-1, 3) @ basis.T
+            moved = horizon + float(solution[-2]) - expected
+            horizon = expected + min(max(moved, -most_pitch), most_pitch)
+            road = np.array([solution[-3], 0.0, solution[-1]])
+            # The same columns, expressed below the new horizon.
+            basis = _basis((self._rows - horizon) / depth)
+            inverse = np.asarray(np.linalg.inv(basis))
+            theta, start = columns @ inverse.T, self._start @ inverse.T
+        normal.ravel()[self._blocks] -= (1.0 - 1.0 / _CORRELATED_ROWS) * information
+        covariance: FloatArray = np.linalg.inv(normal).ravel()[self._blocks]
         # From v, b, c in terms of t to v, b, k in terms of u.
         unit = np.array([1.0, 1.0 / depth, depth])
-        fitted = Curves.through(horizon, self._rows, columns)
-        return Fits(fitted, own * np.outer(unit, unit), self._view.with_horizon(horizon))
+        return Fits(Curves(horizon, theta * unit), covariance * np.outer(unit, unit), self._view.with_horizon(horizon))
 
     def _paint(
         self, row_basis: FloatArray, start: FloatArray, theta: FloatArray, reach: float, horizon: float
     ) -> tuple[FloatArray, FloatArray]:
         """Returns what the bars near the curves `theta` (N, 3) say: normal equations (N, 3, 3) and (N, 3) of shifts."""
         strips = self._strips
-        scale = strips.u * strips.obliquity[:, None]
-        at = (row_basis @ theta[:, :, None])[:, :, 0]
-        place = ((at - strips.x) / scale).astype(np.float32)
+        both = row_basis @ np.stack([theta, start], axis=2)
+        place = ((both[:, :, 0] - strips.x) / self._scale).astype(np.float32)
         distance = strips.across - place[:, :, None]
         distance *= np.float32(1.0 / reach)
         distance *= distance
         distance += np.float32(1.0)
         distance *= distance
-        total, moment = np.moveaxis((self._bars / distance) @ self._moments, 2, 0).astype(np.float64)
-        seen = strips.x + moment / np.maximum(total, 1e-6) * scale
-        residual = seen - (row_basis @ start[:, :, None])[:, :, 0]
+        moments = (self._bars / distance) @ self._moments
+        total, moment = moments[:, :, 0].astype(np.float64), moments[:, :, 1]
+        residual = strips.x + moment / np.maximum(total, 1e-6) * self._scale - both[:, :, 1]
         # A row counts once, however wide its bar; a row without a bar does not count.
         is_near = strips.y - horizon > _FARTHEST * self._view.depth
-        precision = np.minimum(total / 2.0, 1.0) * is_near * self._row_precision
-        weighted = row_basis.swapaxes(1, 2) * precision[:, None]
+        precision = np.minimum(0.5 * total, 1.0) * is_near * self._row_precision
+        weighted = (row_basis * precision[:, :, None]).swapaxes(1, 2)
         return weighted @ row_basis, (weighted @ residual[:, :, None])[:, :, 0]
 
     def _weighted_constraints(
-        self, inverse: FloatArray, start: FloatArray, solution: FloatArray, road: FloatArray, horizon: float
+        self, inverse: FloatArray, theta: FloatArray, road: FloatArray, horizon: float
     ) -> tuple[FloatArray, FloatArray]:
         """Returns the constraints (2 N, 3 N + 3) and their weights (2 N,), lower for boundaries far from the road."""
         depth = self._view.depth
-        shifts = solution[:-3].reshape(-1, 3)
         # How a boundary's parameters change with the horizon if its columns at the anchors stay.
         t = (self._rows - horizon) / depth
-        theta = start + shifts
-        drift = ((theta[:, 1:2] - theta[:, 2:] / t**2) / depth) @ inverse.T
-        self._constraints[:, :, -2] = drift[:, [0, 2]]
-        curving = _CURVING_SHARE * abs(road[2]) / depth
-        sigma = depth * self._strips.obliquity[:, None] * (np.asarray(_COMMON_SIGMA) + curving)
-        tied = theta[:, [0, 2]] + drift[:, [0, 2]] * road[1] - road[[0, 2]]
-        distance = ((tied / sigma) ** 2).sum(axis=1, keepdims=True)
+        drift = ((theta[:, 1:2] - theta[:, 2:] / t**2) / depth) @ inverse[::2].T
+        self._constraints[:, :, -2] = drift
+        sigma = self._sigma_unit * (_COMMON_SIGMA + _CURVING_SHARE * abs(float(road[2])) / depth)
+        distance = (((theta[:, ::2] - road[::2]) / sigma) ** 2).sum(axis=1, keepdims=True)
         weights = sigma**-2.0 / (1.0 + distance / _OUTLIER**2)
-        return self._constraints.reshape(2 * len(start), -1), weights.ravel()
+        return self._constraints.reshape(2 * len(theta), -1), weights.ravel()
 
-    def _normal_equations(
-        self,
-        information: FloatArray,
-        constraints: FloatArray,
-        weights: FloatArray,
-        known: FloatArray,
-        road_sigma: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Returns the normal matrix of all shifts and the road, and the right side with what is known of the road."""
-        number = len(information)
-        normal = constraints.T @ (weights[:, None] * constraints)
-        blocks = normal[: 3 * number, : 3 * number].reshape(number, 3, number, 3)
-        indices = np.arange(number)
-        blocks[indices, :, indices, :] += information
-        normal[: 3 * number, : 3 * number] = blocks.reshape(3 * number, 3 * number)
-        precision = (self._view.depth * road_sigma) ** -2.0
-        normal[[-3, -2, -1], [-3, -2, -1]] += precision
-        right = np.zeros(len(normal))
-        right[-3:] = precision * known
-        return normal, right
+
+def _median(values: FloatArray) -> float:
+    """Returns the median of a few numbers; NumPy's takes longer than the rest of a round."""
+    numbers: list[float] = values.tolist()
+    return median(numbers)
 
 
 def _basis(t: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from lanestream.detection.vanishing_point import VanishingPoint
 from lanestream.images.resizing import resized
 from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import Curves, FloatArray
-from lanestream.road.view import USUAL_LANE_WIDTH, Image, RoadView
+from lanestream.road.view import USUAL_LANE_WIDTH, Image, RoadView, Scaling
 
 # The regressor gives columns at these shares of the depth below the horizon.
 REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
@@ -210,8 +210,7 @@ class RoadRegressor:
 
     def crop(self, detail: Image, view: RoadView) -> NDArray[np.uint8]:
         """Returns the road crop (size, size, 3) in RGB of `detail`, a working image at the detail width."""
-        factor = np.float32(detail.shape[1] / view.width)
-        columns, rows = ((places + np.float32(0.5)) * factor - np.float32(0.5) for places in self.geometry.grid(view))
+        columns, rows = self.geometry.grid(view, Scaling(detail.shape[1] / view.width))
         crop = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 

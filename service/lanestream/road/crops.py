@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.road.curve import Curves
-from lanestream.road.view import WORKING_WIDTH, RoadView, Spans
+from lanestream.road.view import WORKING_WIDTH, RoadView, Scaling, Spans
 
 FloatMap = NDArray[np.float32]
 
@@ -65,11 +65,15 @@ class RoadCropGeometry:
                 "size and detail_width must be positive, above at least 0, narrowest above 0 and at most 1"
             )
 
-    def grid(self, view: RoadView) -> tuple[FloatMap, FloatMap]:
-        """Returns the image columns and rows, each (size, size), at which the pixels of the crop are sampled."""
+    def grid(self, view: RoadView, scaling: Scaling = Scaling(1.0)) -> tuple[FloatMap, FloatMap]:  # noqa: B008
+        """Returns the columns and rows, each (size, size), at which the pixels of the crop are sampled.
+
+        They are in pixels of the view's image, or of that image resized by `scaling`.
+        """
         shares = np.linspace(-self.above, 1.0, self.size)
         reach = 0.5 * view.width * (self.narrowest + (1.0 - self.narrowest) * np.maximum(shares, 0.0))
         across = np.linspace(-1.0, 1.0, self.size, dtype=np.float32)
-        columns = reach.astype(np.float32)[:, None] * across + np.float32(view.middle)
-        rows = (view.horizon + shares * view.depth).astype(np.float32)[:, None]
+        columns = (scaling.factor * reach).astype(np.float32)[:, None] * across
+        columns += np.float32(scaling.to_working(view.middle))
+        rows = scaling.to_working(view.horizon + shares * view.depth).astype(np.float32)[:, None]
         return columns, np.broadcast_to(rows, columns.shape)

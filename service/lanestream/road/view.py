@@ -28,7 +28,9 @@ FARTHEST_VISIBLE: Final = 0.1
 USUAL_LANE_WIDTH: Final = 2.4
 LANE_WIDTHS: Final = (1.1, 4.5)
 
-_VISIBILITY_ROWS: Final = 65
+# Rows in which visibility is tested, as shares of the way from the bottom to the farthest row.
+_TESTED: Final = np.linspace(0.0, 1.0, 65)
+_INDICES: Final = np.arange(len(_TESTED))
 
 
 @dataclass(frozen=True)
@@ -116,12 +118,12 @@ def visible_spans(curves: Curves, view: RoadView, top_share: float = FARTHEST_VI
 
     If a curve leaves the image and comes back, the part nearest to the camera counts.
     """
-    rows = np.linspace(view.bottom, view.row_at(top_share), _VISIBILITY_ROWS)
+    rows = view.bottom + (view.row_at(top_share) - view.bottom) * _TESTED
     columns = curves.x(rows)
     inside = (columns >= 0.0) & (columns <= view.width - 1.0)
     first = inside.argmax(axis=1)
-    left = ~inside & (np.arange(_VISIBILITY_ROWS) > first[:, None])
-    last = np.where(left.any(axis=1), left.argmax(axis=1), _VISIBILITY_ROWS) - 1
+    left = ~inside & (first[:, None] < _INDICES)
+    last = np.where(left.any(axis=1), left.argmax(axis=1), len(rows)) - 1
     top, bottom = rows[last], rows[first]
     # The span of a curve that is nowhere inside is its first row alone.
     return Spans(top, bottom, bottom - top >= 2.0)
