@@ -149,7 +149,7 @@ class _Strips:
         # Five gray levels above its own row's texture is a bar that a person would see. Squared: a few bright dots
         # count for more than a wheel track that is a little lighter all along.
         texture = np.abs(contrast).mean(axis=2, keepdims=True)
-        place = int((1.0 - _BEST_ROWS) * (contrast.shape[1] - 1))
+        place = int((1.0 - _BEST_ROWS) * (self.y.shape[1] - 1))
         best = np.maximum(np.partition(contrast.max(axis=2), place, axis=1)[:, place], 0.0)
         bars: NDArray[np.float32] = (contrast - texture) / (texture + (5.0 + _BEST_FACTOR * best)[:, None, None])
         np.clip(bars, 0.0, 1.0, out=bars)
@@ -207,7 +207,7 @@ class _JointFit:
         most_pitch = _MOST_PITCH * depth if settings.move_horizon else 0.0
         horizon, columns = expected, self._start
         basis = _basis((self._rows - horizon) / depth)
-        inverse: FloatArray = np.linalg.inv(basis)
+        inverse = _inverse(basis)
         theta = start = self._start @ inverse.T
         road = np.array([_median(start[:, 0]), 0.0, _median(start[:, 2])])
         for reach in settings.rounds:
@@ -230,10 +230,10 @@ class _JointFit:
             road = np.array([solution[-3], 0.0, solution[-1]])
             # The same columns, expressed below the new horizon.
             basis = _basis((self._rows - horizon) / depth)
-            inverse = np.asarray(np.linalg.inv(basis))
+            inverse = _inverse(basis)
             theta, start = columns @ inverse.T, self._start @ inverse.T
         normal.ravel()[self._blocks] -= (1.0 - 1.0 / _CORRELATED_ROWS) * information
-        covariance: FloatArray = np.linalg.inv(normal).ravel()[self._blocks]
+        covariance = _inverse(normal).ravel()[self._blocks]
         # From v, b, c in terms of t to v, b, k in terms of u.
         unit = np.array([1.0, 1.0 / depth, depth])
         return Fits(Curves(horizon, theta * unit), covariance * np.outer(unit, unit), self._view.with_horizon(horizon))
@@ -278,6 +278,10 @@ def _median(values: FloatArray) -> float:
     """Returns the median of a few numbers; NumPy's takes longer than the rest of a round."""
     numbers: list[float] = values.tolist()
     return median(numbers)
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
 def _basis(t: FloatArray) -> FloatArray:

@@ -28,7 +28,9 @@ REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
 # Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each.
 UNKNOWN_HORIZONS: Final = (0.32, 0.39, 0.46, 0.53, 0.6)
 
-# A boundary with a larger mean deviation, in image widths, is no guide: the network has not seen such a road.
+# Above the first mean deviation, in image widths, the network looks at the mirrored crop too. A boundary with a larger
+# deviation than the second is not used for the search: the network has not seen such a road.
+_UNCERTAIN: Final = 0.022
 _MOST_UNCERTAIN: Final = 0.1
 # At these anchors lateral positions are compared: farther away all lines of a road are close together.
 _COMPARED: Final = REGRESSOR_ANCHORS[:2]
@@ -203,9 +205,11 @@ class RoadRegressor:
             horizon = outputs[best].view(views[best]).horizon
         view = RoadView(width, height, float(np.clip(horizon, 0.0, 0.85 * height)))
         crop = self.crop(detail, view)
-        # The network's errors differ between a crop and its mirror image, so their mean is the better estimate.
-        straight, mirrored = infer("regressor", np.stack([crop, crop[:, ::-1]]))
-        output = RegressorOutput.of(straight).mean(RegressorOutput.of(mirrored).mirrored)
+        output = RegressorOutput.of(infer("regressor", crop[None])[0])
+        if output.sigma.mean() > _UNCERTAIN:
+            # The network's errors differ between a crop and its mirror image, so their mean is the better estimate.
+            mirrored = RegressorOutput.of(infer("regressor", np.ascontiguousarray(crop[None, :, ::-1]))[0]).mirrored
+            output = output.mean(mirrored)
         return output, output.view(view)
 
     def crop(self, detail: Image, view: RoadView) -> NDArray[np.uint8]:
