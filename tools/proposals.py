@@ -16,7 +16,8 @@ from lanestream.detection.ego_prior import EgoPriorEstimator
 from lanestream.detection.proposals import CandidateSearch
 from lanestream.engine import load_engine
 from lanestream.errors import LanestreamError
-from lanestream_exporter.datasets.splits import Split, data_root, real_frames
+from lanestream_exporter.datasets.manifest import DatasetCollection
+from lanestream_exporter.datasets.splits import Split
 from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, Proposed, judge
 
 COUNTS = (4, 8, 12, 16, 24, 32)
@@ -40,7 +41,7 @@ def steps() -> Iterator[tuple[str, CandidateSearch, EgoPriorEstimator | None]]:
 def main(split: Split, path: Path) -> None:
     """Print the share of labelled boundaries with a true candidate among the first N, by drive and step."""
     try:
-        frames = list(real_frames(data_root(), split))
+        frames = list(DatasetCollection.open().frames(split))
     except LanestreamError as error:
         raise click.ClickException(str(error)) from error
     told: dict[str, dict[str, dict[str, object]]] = {}

@@ -15,7 +15,7 @@ from lanestream.detection.patches import PatchGeometry
 from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
 from lanestream_exporter.alexnet import FULL
-from lanestream_exporter.datasets.splits import data_root
+from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
 from lanestream_exporter.exporting.classifier import ClassifierSubject
 from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
@@ -24,7 +24,6 @@ from lanestream_exporter.exporting.normalisation import NORMALISATIONS
 from lanestream_exporter.exporting.proof import Measured
 from lanestream_exporter.exporting.subject import Precision, Subject
 from lanestream_exporter.samples.prior_regressor import prior_estimator
-from lanestream_exporter.training.config import PatchData
 
 _STRIP = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
 
@@ -96,9 +95,7 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
     # What is no checkpoint is told now, not after the frames have been made.
     subject, training = read_subject(checkpoint, foreign)
     subject = _guided(subject, given["guide"])
-    own = _own_frames(training)
-    root = data_root(given["data"]) if given["data"] and own is None else None
-    source = FrameSource(root, rendered=given["scenes"], own=own)
+    source = FrameSource(_datasets(training, given["data"]), rendered=given["scenes"])
     energy = subject.rank_energy if given["rank_energy"] is None else given["rank_energy"]
     settings = ExportSettings(given["name"] or subject.name, energy, given["precision"], given["tolerance"])
     _tell(out, export_network(subject, out, settings, Provenance(training, source), click.echo), source)
@@ -114,13 +111,15 @@ def _guided(subject: Subject, named: Path | None) -> Subject:
     return subject
 
 
-def _own_frames(training: dict[str, Any]) -> PatchData | None:
-    """The labelled frames that a network was trained on, where they were somebody's own and are here."""
-    data = training.get("config", {}).get("data", {})
-    paths = [frames["path"] for key in ("train", "validation") for frames in data.get(key, [])]
-    if not paths or not all(Path(path).exists() for path in paths):
-        return None
-    return PatchData.model_validate({key: data[key] for key in ("train", "validation", "validation_share")})
+def _datasets(training: dict[str, Any], data: Path | None) -> DatasetCollection | None:
+    """Returns the data sets of the manifest that a network was trained with; None if its frames are not available.
+
+    The shipped manifest is only used with a data folder, `data`.
+    """
+    manifest = training.get("config", {}).get("data", {}).get("manifest")
+    if manifest is not None and Path(manifest).is_file():
+        return DatasetCollection.open(Path(manifest), data)
+    return None if data is None else DatasetCollection.open(None, data)
 
 
 def _foreign(classes: tuple[str, ...] | None, strip: PatchGeometry | None, normalisation: str) -> Foreign | None:

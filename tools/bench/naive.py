@@ -108,7 +108,7 @@ def create_app(most: int) -> FastAPI:
     """The service; `most` is how many candidates of a frame are judged."""
     app = FastAPI()
     torch.manual_seed(0)
-    network = AlexNet(normalised=False).eval()
+    network = AlexNet(batch_norm=False).eval()
     lane_probabilities(network, np.zeros((most, FULL.size, FULL.size, 3), np.uint8))
 
     @app.get("/readyz")

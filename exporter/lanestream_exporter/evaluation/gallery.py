@@ -13,7 +13,7 @@ from lanestream.road.curve import FloatArray
 from lanestream.road.view import Image
 from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.figures import match_all
-from lanestream_exporter.evaluation.measuring import Material
+from lanestream_exporter.evaluation.measuring import EvaluationSet
 from lanestream_exporter.evaluation.outcomes import Outcome
 
 FRAMES = 24
@@ -29,12 +29,12 @@ class Exhibit:
     picture: str = field(repr=False)
 
 
-def gallery(material: Material, outcomes: Sequence[Outcome]) -> list[Exhibit]:
+def gallery(evaluation_set: EvaluationSet, outcomes: Sequence[Outcome]) -> list[Exhibit]:
     """The worst frames, worst first. Reads the images again, so that an evaluation need not keep them."""
     worst = sorted(range(len(outcomes)), key=lambda i: _badness(outcomes[i]), reverse=True)[:FRAMES]
     wanted = {index: place for place, index in enumerate(worst)}
     exhibits: dict[int, Exhibit] = {}
-    for index, (_, image) in enumerate(material.images()):
+    for index, (_, image) in enumerate(evaluation_set.images()):
         if index in wanted:
             exhibits[wanted[index]] = _exhibit(image, outcomes[index])
     return [exhibits[place] for place in sorted(exhibits)]

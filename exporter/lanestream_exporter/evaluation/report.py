@@ -33,7 +33,7 @@ def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any
         block={"stills": STILLS, "span": SPAN},
         charts=charts(evaluation, figures),
         shown=first.name,
-        gallery=gallery(evaluation.material, evaluation.images[first.name]),
+        gallery=gallery(evaluation.evaluation_set, evaluation.images[first.name]),
     )
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "report.html"

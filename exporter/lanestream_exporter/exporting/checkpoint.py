@@ -59,8 +59,8 @@ def read_subject(path: Path, foreign: Foreign | None = None) -> tuple[Subject, d
 def _own(path: Path, state: Mapping[str, Any]) -> Subject:
     weights = state["network"]
     shape = _recorded_shape(path, state)
-    if "shape.0.weight" in weights:
-        regressor = LaneRegressor(shape, normalised=_has_norms(weights))
+    if "column_head.0.weight" in weights:
+        regressor = LaneRegressor(shape, batch_norm=_has_norms(weights))
         _load(path, regressor, weights)
         return RegressorSubject(regressor.eval().folded())
     return ClassifierSubject(_alexnet(path, weights, shape), strip=PatchGeometry(shape.size))
@@ -105,7 +105,7 @@ def _alexnet(path: Path, weights: Mapping[str, Tensor], shape: Shape) -> AlexNet
         raise CheckpointError(
             f"{path} tells {len(last)} classes apart, and the service knows two", "fine-tune it with a last layer of 2"
         )
-    network = AlexNet(shape=shape, normalised=_has_norms(weights))
+    network = AlexNet(shape=shape, batch_norm=_has_norms(weights))
     _load(path, network, weights)
     return network.eval().folded()
 

@@ -22,7 +22,7 @@ def imagenet(images: Tensor) -> Tensor:
 
 
 def contrast(images: Tensor) -> Tensor:
-    """The same as `alexnet.normalise`, in fewer passes over the pixels: beside an int8 network each of them counts."""
+    """The same as `alexnet.normalize`, in fewer passes over the pixels: beside an int8 network each of them counts."""
     told = images[:, ::4].float()
     mean = told.mean(dim=(1, 2, 3), keepdim=True)
     centred = told - mean

@@ -24,8 +24,8 @@ from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.normalisation import contrast
 from lanestream_exporter.exporting.subject import Check, Description, Figures
 from lanestream_exporter.exporting.versions import exporter
-from lanestream_exporter.regressor import Answer, LaneRegressor
-from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction
+from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, warped_road_crop
 from lanestream_exporter.samples.road_frames import RoadFrame
 
 _MOST_RANGING: Final = 1024
@@ -50,8 +50,8 @@ class ServedRegressor(nn.Module):
 
     def forward(self, canvases: Tensor) -> Tensor:
         """Only the network itself is ever in half precision."""
-        answer = Answer.of(self.network(contrast(canvases).to(self.dtype)).float())
-        return replace(answer, presence=answer.presence / self.temperature).told()
+        answer = RegressorPrediction.of(self.network(contrast(canvases).to(self.dtype)).float())
+        return replace(answer, presence=answer.presence / self.temperature).served()
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class RegressorSubject:
     input_name = "canvases"
     output_name = "readings"
     # Few weights and little time, but every output hangs on them, on a thousandth of an image's width.
-    exact = ("network.features.0.", "network.hidden.", "network.shape.", "network.doubts.")
+    exact = ("network.features.0.", "network.hidden.", "network.column_head.", "network.auxiliary_head.")
     rank_energy = 0.99996
     headline = ("accuracy", "presence_accuracy")
 
@@ -79,7 +79,7 @@ class RegressorSubject:
         rng = np.random.default_rng(0)
         geometry = self.detector.geometry
         canvases = [
-            sample(frame, geometry, warp)[0] for frame in source.roads("train") for warp in _warps(frame, rng)
+            warped_road_crop(frame, geometry, warp)[0] for frame in source.roads("train") for warp in _warps(frame, rng)
         ]  # fmt: skip
         return np.stack([canvases[i] for i in rng.permutation(len(canvases))[:_MOST_RANGING]])
 
@@ -89,7 +89,7 @@ class RegressorSubject:
         frames = source.roads("val")
         for frame in frames:
             image = decode(frame.jpeg, ImageLimits())
-            target = sample(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
+            target = warped_road_crop(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
             for horizon in (frame.horizon, None):
                 prepared.append(self.detector.prepare(image, horizon))
                 targets.append((target.columns, target.known, target.presence, frame.horizon))
@@ -177,7 +177,7 @@ def _warps(frame: RoadFrame, rng: np.random.Generator) -> Iterator[Warp]:
     yield plain_warp(frame, known=True)
     yield plain_warp(frame, known=False)
     for _ in range(_WARPS):
-        yield Warp.drawn(rng)
+        yield Warp.random(rng)
 
 
 def _mean(values: NDArray[np.bool_] | NDArray[np.float64]) -> float:

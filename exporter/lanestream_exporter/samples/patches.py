@@ -1,7 +1,7 @@
-"""Candidates to labelled patches: what the classifier is trained and measured on.
+"""Turns candidates into labeled patches, which the classifier is trained and evaluated on.
 
-Candidates and strips come from the service's own code. A candidate is true where it follows a label over most of it,
-false where it is far from every label, and left out of training in between, where nobody could say.
+Candidates and patches come from the service's own code. A candidate is true if it follows a label over most of its
+rows, false if it is far from every label, and left out of training in between.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from lanestream.detection.proposals import CandidateSearch, Proposals
 from lanestream.road.curve import Curve, FloatArray
 from lanestream.road.results import Candidate
 from lanestream.road.view import Image, RoadView, visible_rows
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
-from lanestream_exporter.datasets.polylines import fitted_curve
+from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane, fitted_curve
 
 FALSE, TRUE, UNSURE, UNKNOWN = 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
 class TruthRule:
-    """When a candidate is true: distances across the line, in pixels of a 1280 pixel wide image.
+    """Decides whether a candidate is true. Distances are across the line, in pixels of a 1280 pixel wide image.
 
-    True up to `near` on average over at least `overlap` of a label's rows, false beyond `far` from every label, unsure
-    in between. Beyond the outermost label, on a side where not all is labelled, it is unknown.
+    A candidate is true if its mean distance is at most `near` over at least `overlap` of a label's rows, false if it is
+    farther than `far` from every label, and unsure in between. Beyond the outermost label, on a side that is not fully
+    labeled, it is unknown.
     """
 
     near: float = 12.0
@@ -38,7 +38,7 @@ class TruthRule:
     overlap: float = 0.6
 
     def judge(self, candidates: Sequence[Candidate], frame: LabelledFrame, view: RoadView) -> NDArray[np.int64]:
-        """FALSE, TRUE, UNSURE or UNKNOWN for each candidate (N,)."""
+        """Returns FALSE, TRUE, UNSURE or UNKNOWN for each candidate (N,)."""
         return np.array([self._judge(candidate, frame, view) for candidate in candidates], dtype=np.int64)
 
     def _judge(self, candidate: Candidate, frame: LabelledFrame, view: RoadView) -> int:
@@ -51,31 +51,31 @@ class TruthRule:
         return UNKNOWN if self._beyond(candidate, frame) else FALSE
 
     def _beyond(self, candidate: Candidate, frame: LabelledFrame) -> bool:
-        """Whether half of the candidate lies beside the outermost label of a side that is open."""
+        """Whether half of the candidate lies outside the outermost label on an open side."""
         rows = np.linspace(candidate.top, candidate.bottom, 16)
         columns = candidate.curve.x(rows)
         left, right = np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
         for lane in frame.lanes:
             x = columns_at(lane, rows)
             left, right = np.fmin(left, x), np.fmax(right, x)
-        # Rows without any label count for both sides.
+        # Rows without any label count as outside on both sides.
         return any(
-            frame.open_to(side) and beside.mean() >= 0.5
-            for side, beside in ((-1, columns <= left), (1, columns >= right))
+            frame.open_to(side) and outside.mean() >= 0.5
+            for side, outside in ((-1, columns <= left), (1, columns >= right))
         )
 
 
 def columns_at(lane: LabelledLane, rows: FloatArray) -> FloatArray:
-    """Columns of a label at `rows`, NaN outside its extent."""
+    """Returns the columns of a label at `rows`, NaN outside its extent."""
     order = np.argsort(lane.points[:, 1], kind="stable")
     y, x = lane.points[order, 1], lane.points[order, 0]
     return np.asarray(np.interp(rows, y, x, left=np.nan, right=np.nan))
 
 
 def distance_along(candidate: Candidate, lane: LabelledLane, view: RoadView) -> tuple[float, float]:
-    """(mean distance across the line in pixels, share of the label's rows that the candidate covers)."""
+    """Returns (mean distance across the line in pixels, share of the label's rows that the candidate covers)."""
     top, bottom = float(lane.points[:, 1].min()), float(lane.points[:, 1].max())
-    # Labels that reach to the horizon and above do so by guess; a candidate can't follow them there.
+    # Labels near or above the horizon are guesses, and a candidate can't follow them there.
     top = max(top, view.row_at(0.08))
     rows = np.linspace(top, bottom, 48) if bottom > top else np.zeros(0)
     covered = rows[(rows >= candidate.top - 1.0) & (rows <= candidate.bottom + 1.0)]
@@ -86,7 +86,7 @@ def distance_along(candidate: Candidate, lane: LabelledLane, view: RoadView) -> 
 
 
 def fitted_candidate(lane: LabelledLane, view: RoadView) -> Candidate | None:
-    """A label as a candidate: the best curve under the view's horizon; None where too little of it is in view."""
+    """Returns the best curve through a label under the view's horizon; None if too little of it is in view."""
     points = lane.points[lane.points[:, 1] > view.row_at(0.08)]
     if len(points) < 3:
         return None
@@ -99,41 +99,41 @@ def fitted_candidate(lane: LabelledLane, view: RoadView) -> Candidate | None:
 
 @dataclass(frozen=True)
 class PatchMaker:
-    """Frames to patches and their labels; candidates are proposed with a `glance` at the frame, where there is one."""
+    """Cuts labeled patches from frames; candidates are proposed with the ego-lane prior, if there is an estimator."""
 
     search: CandidateSearch = CandidateSearch()
     cutter: PatchCutter = PatchCutter()
     rule: TruthRule = TruthRule()
-    glance: EgoPriorEstimator | None = None
+    prior_estimator: EgoPriorEstimator | None = None
 
     def propose(self, image: Image) -> Proposals:
-        """The candidates of a BGR image (H, W, 3) of which nothing is known."""
-        prior = None if self.glance is None else answered(self.glance.look(image))
+        """Returns the candidates of a BGR image (H, W, 3) with an unknown horizon."""
+        prior = None if self.prior_estimator is None else answered(self.prior_estimator.look(image))
         return self.search.propose(image, prior=prior)
 
     def proposed(
         self, image: Image, frame: LabelledFrame, proposals: Proposals
     ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Patches (N, size, size, 3) of the frame's own candidates, and what each is (N,)."""
+        """Returns patches (N, size, size, 3) of the proposed candidates, and the verdict on each (N,)."""
         verdicts = self.rule.judge(proposals.candidates, frame, proposals.view)
         return self.cutter.cut(image, proposals.candidates, proposals.view), verdicts
 
     def jittered(
         self, image: Image, frame: LabelledFrame, view: RoadView, rng: np.random.Generator
     ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Patches beside each label: as a candidate would err, and as far off as a candidate must not be."""
+        """Returns patches near each label, as close as good candidates and too far off, and the verdict on each."""
         candidates: list[Candidate] = []
         for lane in frame.lanes:
             fitted = fitted_candidate(lane, view)
             if fitted is not None:
-                candidates += [_moved(fitted, view, shift) for shift in _shifts(rng)]
+                candidates += [_shifted(fitted, view, shift) for shift in _shifts(rng)]
         verdicts = self.rule.judge(candidates, frame, view)
         return self.cutter.cut(image, candidates, view), verdicts
 
     def all_of(
         self, image: Image, frame: LabelledFrame, view: RoadView, rng: np.random.Generator
     ) -> Iterator[tuple[NDArray[np.uint8], int]]:
-        """Trainable patches of a frame one by one: proposed and jittered ones that are clearly true or false."""
+        """Yields the patches of a frame, proposed and jittered, that are clearly true or false."""
         proposed = self.proposed(image, frame, self.propose(image))
         for patches, verdicts in (proposed, self.jittered(image, frame, view, rng)):
             for patch, verdict in zip(patches, verdicts, strict=True):
@@ -143,28 +143,28 @@ class PatchMaker:
 
 @dataclass(frozen=True)
 class _Shift:
-    """How a candidate errs: sideways in rows below the horizon at the bottom and half way up, and in its bend."""
+    """A candidate's error, as shares of the rows below the horizon; `near` and `far` are sideways, `far` halfway up."""
 
     near: float
     far: float
-    bend: float
+    curvature: float
 
 
 def _shifts(rng: np.random.Generator) -> list[_Shift]:
-    """One small as a candidate's error, one beyond the true marking."""
+    """Returns a shift of the size of a good candidate's error, and one that leaves the marking."""
     near, far = rng.normal(0.0, 0.02, 2)
     beyond = rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.45)
     return [_Shift(near, far, rng.normal(0.0, 0.003)), _Shift(beyond + near, beyond + far, rng.normal(0.0, 0.003))]
 
 
-def _moved(candidate: Candidate, view: RoadView, shift: _Shift) -> Candidate:
-    """The candidate moved by `shift`, a leaning one farther, as its strip is wider and its error counts less."""
+def _shifted(candidate: Candidate, view: RoadView, shift: _Shift) -> Candidate:
+    """Returns the candidate moved by `shift`. An oblique one moves farther, because its patch is wider."""
     v, b, k = candidate.curve.coefficients
-    leaning = float(np.hypot(1.0, b))
-    near, far = leaning * shift.near * view.depth, leaning * shift.far * 0.5 * view.depth
+    obliquity = float(np.hypot(1.0, b))
+    near, far = obliquity * shift.near * view.depth, obliquity * shift.far * 0.5 * view.depth
     tilt = (near - far) / (0.5 * view.depth)
-    bend = shift.bend * view.depth**2
-    curve = Curve(candidate.curve.horizon, (v + near - tilt * view.depth, b + tilt, k + bend))
+    curvature = shift.curvature * view.depth**2
+    curve = Curve(candidate.curve.horizon, (v + near - tilt * view.depth, b + tilt, k + curvature))
     rows = visible_rows(curve, view, 0.1)
     top, bottom = rows if rows is not None else (candidate.top, candidate.bottom)
     return Candidate(curve, top, bottom, candidate.strength)

@@ -1,4 +1,4 @@
-"""Guides: regressors that show a classifier where to look, as in the service."""
+"""The regressor whose ego-lane prior the candidate search uses, as in the service."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from lanestream.engine import load_engine
 from lanestream.errors import ModelError
 from lanestream.runtime import RuntimeOptions
 
-_HINT = "give a regressor's ONNX file as the guide"
+_HINT = "give a regressor's ONNX file"
 
 
-def prior_estimator(guide: Path) -> EgoPriorEstimator:
-    """The glance by the regressor at `guide`, on one thread of the CPU. Raises ModelError where there is none."""
-    if not guide.is_file():
-        raise ModelError(f"can't read {guide}: no such file", _HINT)
-    glance = load_engine(guide, "cpu", None, RuntimeOptions(threads=1)).pipeline().first_look
-    if glance is None:
-        raise ModelError(f"{guide} is not a regressor", _HINT)
-    return glance
+def prior_estimator(regressor: Path) -> EgoPriorEstimator:
+    """Returns the ego-lane prior of the ONNX file `regressor`, on one CPU thread. Raises ModelError for other files."""
+    if not regressor.is_file():
+        raise ModelError(f"can't read {regressor}: no such file", _HINT)
+    estimator = load_engine(regressor, "cpu", None, RuntimeOptions(threads=1)).pipeline().first_look
+    if estimator is None:
+        raise ModelError(f"{regressor} is not a regressor", _HINT)
+    return estimator

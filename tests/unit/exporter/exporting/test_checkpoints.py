@@ -11,10 +11,10 @@ from torch import Tensor
 
 from lanestream.detection.patches import PatchGeometry
 from lanestream.errors import CheckpointError
-from lanestream_exporter.alexnet import AlexNet, Shape, initialise
+from lanestream_exporter.alexnet import AlexNet, Shape, load_torchvision_weights
 from lanestream_exporter.exporting.checkpoint import Foreign, read_subject
 from lanestream_exporter.exporting.classifier import ClassifierSubject
-from lanestream_exporter.training.checkpoints import read_checkpoint
+from lanestream_exporter.training.run_files import read_checkpoint
 
 Weights = dict[str, Tensor]
 
@@ -25,7 +25,7 @@ FOREIGN = Foreign(("false", "lane"), PatchGeometry(224, half_width=0.4))
 def theirs() -> Weights:
     """As torchvision's recipe saves it, fine-tuned to two classes."""
     torch.manual_seed(0)
-    return AlexNet(normalised=False).state_dict()
+    return AlexNet(batch_norm=False).state_dict()
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_wrong_checkpoints_are_refused(tmp_path: Path) -> None:
         with pytest.raises(CheckpointError):
             read_checkpoint(path)
         with pytest.raises(CheckpointError):
-            initialise(AlexNet(), path)
+            load_torchvision_weights(AlexNet(), path)
         for foreign in (None, FOREIGN):
             with pytest.raises(CheckpointError) as caught:
                 read_subject(path, foreign)
@@ -57,10 +57,10 @@ def test_wrong_checkpoints_are_refused(tmp_path: Path) -> None:
 
 def test_torchvision_weights_are_taken_over(tmp_path: Path) -> None:
     path = tmp_path / "alexnet.pt"
-    theirs = AlexNet(1000, normalised=False)
+    theirs = AlexNet(1000, batch_norm=False)
     torch.save(theirs.state_dict(), path)
     mine = AlexNet()
-    initialise(mine, path)
+    load_torchvision_weights(mine, path)
     assert torch.equal(mine.features[3].weight, theirs.features[3].weight)  # type: ignore[arg-type, union-attr]
     assert mine.classes == 2
 
@@ -103,7 +103,7 @@ def test_a_network_from_elsewhere_needs_only_classes_and_strips(saved: Any, thei
     assert isinstance(subject, ClassifierSubject)
     assert (subject.normalisation, subject.strip.half_width) == ("imagenet", 0.4)
     x = torch.randn(1, 3, 224, 224, generator=torch.Generator().manual_seed(1))
-    network = AlexNet(normalised=False).eval()
+    network = AlexNet(batch_norm=False).eval()
     network.load_state_dict(theirs)
     with torch.inference_mode():
         assert torch.equal(subject.network(x), network(x))

@@ -17,7 +17,7 @@ from lanestream.engine import load_engine
 from lanestream.errors import ExportError, ModelError
 from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
 from lanestream.inference.model_info import METADATA_KEY
-from lanestream_exporter.alexnet import AlexNet, Shape, normalise
+from lanestream_exporter.alexnet import AlexNet, Shape, normalize
 from lanestream_exporter.exporting import export
 from lanestream_exporter.exporting.calibration import Calibration
 from lanestream_exporter.exporting.classifier import ClassifierSubject
@@ -27,7 +27,7 @@ from lanestream_exporter.exporting.frames import FrameSource
 from lanestream_exporter.exporting.graph import describe, write_graph
 from lanestream_exporter.exporting.regressor import RegressorSubject
 from lanestream_exporter.exporting.subject import Check, Description, Precision, Subject
-from lanestream_exporter.regressor import Answer, LaneRegressor
+from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction
 
 SOURCE = FrameSource(None, rendered=4)
 PROVENANCE = Provenance({"data": "none", "step": 7}, SOURCE)
@@ -58,10 +58,10 @@ def exported(subject: Subject, precision: Precision, folder: Path) -> Exported:
 @pytest.fixture(scope="module")
 def classifier(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     torch.manual_seed(0)
-    network = AlexNet(shape=Shape(112, 0.5, 512), normalised=False).eval()
+    network = AlexNet(shape=Shape(112, 0.5, 512), batch_norm=False).eval()
     subject = ClassifierSubject(network, strip=PatchGeometry(112))
     # A fresh AlexNet answers every patch alike: its small differences are made large, about their mean.
-    logits = in_batches(lambda part: network(normalise(part)), subject.ranging(SOURCE))
+    logits = in_batches(lambda part: network(normalize(part)), subject.ranging(SOURCE))
     last = network.classifier[6]
     assert isinstance(last, torch.nn.Linear)
     with torch.no_grad():
@@ -112,7 +112,7 @@ def test_the_regressors_file_says_what_its_answer_is(regressor: Exported) -> Non
     assert isinstance(subject, RegressorSubject)
     inputs = regressor.check.inputs
     with torch.inference_mode():
-        answer = Answer.of(subject.network(normalise(torch.from_numpy(inputs))))
+        answer = RegressorPrediction.of(subject.network(normalize(torch.from_numpy(inputs))))
     told = replace(answer, presence=answer.presence / subject.calibration.temperature).told().numpy()
     np.testing.assert_allclose(OnnxModel.load(regressor.path, "cpu").run(inputs), told, atol=1e-4)
     assert regressor.report.written is regressor.report.fp32
@@ -142,7 +142,7 @@ def test_the_regressors_small_layers_stay_exact_in_int8(regressor: Exported, tmp
     export.quantized(regressor.path, small, regressor.check.inputs, subject.exact)
     weights = {tensor.name: tensor.data_type for tensor in onnx.load(str(small)).graph.initializer}
     floats = [name for name, kind in weights.items() if kind == onnx.TensorProto.FLOAT and name.endswith("weight")]
-    assert {name.split(".")[1] for name in floats} == {"features", "hidden", "shape", "doubts"}
+    assert {name.split(".")[1] for name in floats} == {"features", "hidden", "column_head", "auxiliary_head"}
     assert [name for name in floats if ".features." in name] == ["network.features.0.weight"]
     info = OnnxModel.load(regressor.path, "cpu").info
     describe(small, info)
