@@ -63,7 +63,7 @@ def _frames(path: Path) -> list[Any]:
         return _items(found["ld"].frames)
     except OSError as error:
         raise LabelError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
-    except Exception as error:  # loadmat raises whatever its parser happens to hit in a broken file
+    except Exception as error:  # loadmat raises many types of errors for broken files
         raise LabelError(
             f"{path} is not a label file of the Caltech labeler: {error}", "a MATLAB file, version 5 to 7, is accepted"
         ) from None

@@ -10,11 +10,11 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, numbered, size_of
 from lanestream_exporter.datasets.files import (
     DataFolder,
-    checked_json_lines,
+    scan_json_lines,
     drive_of,
     error_at,
     field_error,
-    json_lines,
+    read_json_lines,
     path_in_labels,
 )
 from lanestream_exporter.datasets.images import ImageLocation
@@ -47,7 +47,7 @@ def read_clip_labels(path: Path, coverage: Coverage = PARTIAL) -> dict[int, Labe
     `coverage` says what the labels cover. Raises LabelError that names the file and the line.
     """
     frames: dict[int, LabelledFrame] = {}
-    for place, record in json_lines(path):
+    for place, record in read_json_lines(path):
         try:
             frames[int(record["frame"])] = _frame(record, path, coverage)
         except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -63,7 +63,7 @@ def _frame(record: dict[str, Any], path: Path, coverage: Coverage) -> LabelledFr
 
 
 def _file_entries(path: Path, folder: DataFolder) -> LabelEntries:
-    for place, record in checked_json_lines(path):
+    for place, record in scan_json_lines(path):
         if isinstance(record, LabelError):
             yield record
             continue

@@ -91,16 +91,16 @@ def path_in_labels(name: str) -> Path:
     return Path(name.replace("\\", "/"))
 
 
-def json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def read_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yields (place, object) for each line of `path`, the place as `file:line`. Raises LabelError for a bad line."""
-    for place, record in checked_json_lines(path):
+    for place, record in scan_json_lines(path):
         if isinstance(record, LabelError):
             raise record
         yield place, record
 
 
-def checked_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelError]]:
-    """Yields the same as `json_lines`, but the error of a bad line instead of raising it, and then the next lines."""
+def scan_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelError]]:
+    """Yields the same as `read_json_lines`, but the error of a bad line instead of raising it, and then the next lines."""
     try:
         lines = read_text(path).splitlines()
     except LabelError as error:

@@ -103,7 +103,7 @@ def checked_points(points: FloatArray, width: int, height: int) -> FloatArray:
     """Returns `points` (N, 2), in pixels of an image of this size, from the lowest row upwards, each row once.
 
     Points that go back down by up to `POINT_TOLERANCE` are dropped. Raises ValueError that says what is wrong: fewer
-    than two points, values that are not numbers, points outside the image, rows that turn back.
+    than two points, values that are not numbers, points outside the image, rows that go back down.
     """
     if len(points) < 2:
         raise ValueError("it has one point; at least two are needed" if len(points) else "it has no points")
@@ -119,7 +119,7 @@ def checked_points(points: FloatArray, width: int, height: int) -> FloatArray:
     back = points[:, 1] - reached
     if back.max() > slack:
         first = points[back > slack][0]
-        raise ValueError(f"its rows turn back at {_coordinates(first)}; a lane boundary crosses each row once")
+        raise ValueError(f"its rows go back down at {_coordinates(first)}; a lane boundary crosses each row once")
     climbs = np.concatenate([[True], points[1:, 1] < reached[:-1]])
     if climbs.sum() < 2:
         raise ValueError(f"its points all lie on row {points[0, 1]:g}")

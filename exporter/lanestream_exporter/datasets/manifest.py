@@ -124,7 +124,7 @@ class DatasetCollection:
     @property
     def any_present(self) -> bool:
         """Whether the data folder holds at least one of the data sets."""
-        return any((self.root / spec.path).exists() for spec in self.manifest.dataset)
+        return any(map(self._is_present, self.manifest.dataset))
 
     def frames(self, split: Split) -> LabelledImages:
         """Yields the labeled frames of a split, one data set after another. Raises LabelError for a bad record."""
@@ -180,7 +180,7 @@ class DatasetCollection:
     def fingerprint(self) -> str:
         """Returns a hash that changes with the manifest and with the files of its data sets."""
         digest = hashlib.sha256(self.manifest.model_dump_json().encode())
-        for spec in self.manifest.dataset:
+        for spec in filter(self._is_present, self.manifest.dataset):
             for file in DataFolder.at(self._path(spec)).files:
                 status = file.stat()
                 digest.update(f"{file} {status.st_size} {status.st_mtime_ns}\n".encode())
@@ -192,6 +192,8 @@ class DatasetCollection:
                 yield spec, entry
 
     def _entries_of(self, spec: DatasetSpec, split: Split) -> Iterator[LabelEntry]:
+        if isinstance(spec.split, WholeSplit) and spec.split.split != split:
+            return iter(())  # such a data set may be missing
         groups = self._validation_groups[spec.name]
         return (entry for entry in self._read(spec) if split_of(spec.split, entry, groups) == split)
 
@@ -202,9 +204,12 @@ class DatasetCollection:
                 raise entry
             yield entry
 
+    def _is_present(self, spec: DatasetSpec) -> bool:
+        return (self.root / spec.path).exists()
+
     def _path(self, spec: DatasetSpec) -> Path:
         path = self.root / spec.path
-        if not path.exists():
+        if not self._is_present(spec):
             raise LabelError(
                 f"the data set {spec.name!r} is missing: there is nothing at {path}",
                 "give the folder that the manifest's paths count from with --data or LANESTREAM_DATA",
@@ -215,12 +220,12 @@ class DatasetCollection:
     def _validation_groups(self) -> dict[str, frozenset[str]]:
         """The groups that each data set's GroupSplit chose to validate with, by the data set's name.
 
-        Raises LabelError if two data sets put the same drive or clip into different splits.
+        Raises LabelError if two data sets put the same drive or clip into different splits. Missing data sets are
+        skipped here; they are reported when their frames are read.
         """
-        chosen: dict[str, frozenset[str]] = {}
+        chosen: dict[str, frozenset[str]] = {spec.name: frozenset() for spec in self.manifest.dataset}
         parts: dict[str, set[tuple[Split, str]]] = {}  # by group: the splits and data sets that it is in
-        for spec in self.manifest.dataset:
-            chosen[spec.name] = frozenset()
+        for spec in filter(self._is_present, self.manifest.dataset):
             if isinstance(spec.split, GroupSplit):
                 groups = (entry.group for entry in self._read(spec))
                 chosen[spec.name] = split_by_group(groups, spec.split.val, spec.split.seed).validation

@@ -15,7 +15,7 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, numbered
 from lanestream_exporter.datasets.files import (
     DataFolder,
-    checked_json_lines,
+    scan_json_lines,
     drive_of,
     error_at,
     field_error,
@@ -35,7 +35,7 @@ def is_tusimple(path: Path, start: bytes) -> bool:
 def tusimple_entries(folder: DataFolder) -> LabelEntries:
     """Yields the frames of TuSimple's JSON lines files. A group is a drive: 0313-1 of clips/0313-1/6040/20.jpg."""
     for path in folder.with_suffix(".json", ".jsonl"):
-        for place, record in checked_json_lines(path):
+        for place, record in scan_json_lines(path):
             if isinstance(record, LabelError):
                 yield record
                 continue

@@ -57,7 +57,7 @@ def only_fault(path: Path, format_name: str = "auto") -> str:
         ([[10, 10]], "lane 1: it has one point"),
         ([[10, 20], [float("nan"), 10]], "lane 1: one of its points is not a number"),
         ([[10, 20], [None, 10]], "lane 1: one of its points is not a number"),
-        ([[10, 150], [20, 100], [30, 120], [40, 80]], "lane 1: its rows turn back at (30, 120)"),
+        ([[10, 150], [20, 100], [30, 120], [40, 80]], "lane 1: its rows go back down at (30, 120)"),
         ([[10, 150], [20, 150]], "lane 1: its points all lie on row 150"),
         ([[10, 150], [350, 100]], "lane 1: (350, 100) is outside the image of 320 x 180"),
         ([[10, 150, 1], [20, 100, 1]], "lane 1: its points are not pairs of numbers"),
@@ -125,7 +125,7 @@ def test_bad_tusimple_records_are_reported(tmp_path: Path, draw: Draw) -> None:
     assert "labels.json:1: lane 1 has 2 columns, but there are 3 h_samples" in found[0]
     assert "labels.json:2: " in found[1]
     assert "outside the data set's folder" in found[1]
-    assert "labels.json:3: lane 1: its rows turn back" in found[2]
+    assert "labels.json:3: lane 1: its rows go back down" in found[2]
     assert "labels.json:4: there is no 'raw_file'" in found[3]
     assert len(found) == 4
 

@@ -153,6 +153,20 @@ def test_a_missing_data_set_is_reported_with_the_folder_that_paths_count_from(tm
         list(datasets.frames("train"))
 
 
+def test_a_missing_data_set_of_another_split_does_not_matter(tmp_path: Path, draw: Draw) -> None:
+    draw_drives(tmp_path, draw, "monday")
+    datasets = opened(
+        tmp_path,
+        {"name": "gone", "path": "gone", "split": "train"},
+        {"name": "monday", "path": "monday", "split": "test"},
+    )
+    assert datasets.any_present
+    assert [frame.source for frame, _ in datasets.frames("test")] == ["0.jpg", "1.jpg"]
+    assert datasets.fingerprint()
+    with pytest.raises(LabelError, match="'gone' is missing"):
+        list(datasets.frames("train"))
+
+
 def test_the_data_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     manifest = write_manifest(tmp_path / "datasets.toml", {"name": "a", "path": "a", "split": "train"})
     monkeypatch.setenv("LANESTREAM_DATA", "named")
