@@ -5,14 +5,17 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, TypeVar, get_args
+from typing import Annotated, Final, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lanestream.errors import SettingsError
 
 # The recipes and the data set manifest that are shipped with the package.
 CONFIG_FOLDER: Final = Path(__file__).parent / "configs"
+
+# A share of a whole, from 0 to 1.
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 # The keys whose value says which of several sections a table is.
 _TAGS: Final = ("kind", "by")

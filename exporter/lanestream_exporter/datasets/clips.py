@@ -10,12 +10,12 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, numbered, size_of
 from lanestream_exporter.datasets.files import (
     DataFolder,
-    scan_json_lines,
     drive_of,
     error_at,
     field_error,
-    read_json_lines,
     path_in_labels,
+    read_json_lines,
+    scan_json_lines,
 )
 from lanestream_exporter.datasets.images import ImageLocation
 from lanestream_exporter.datasets.labels import PARTIAL, Coverage, LabelledFrame, LabelledLane, points_of

@@ -100,7 +100,7 @@ def read_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def scan_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelError]]:
-    """Yields the same as `read_json_lines`, but the error of a bad line instead of raising it, and then the next lines."""
+    """Like `read_json_lines`, but yields the error of a bad line instead of raising it, and continues."""
     try:
         lines = read_text(path).splitlines()
     except LabelError as error:

@@ -15,11 +15,11 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, numbered
 from lanestream_exporter.datasets.files import (
     DataFolder,
-    scan_json_lines,
     drive_of,
     error_at,
     field_error,
     path_in_labels,
+    scan_json_lines,
 )
 from lanestream_exporter.datasets.images import ImageLocation
 from lanestream_exporter.datasets.labels import LabelledLane

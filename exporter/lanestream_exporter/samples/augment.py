@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lanestream_exporter.toml_files import Section
+from lanestream_exporter.toml_files import Section, Share
 
 Pixels = NDArray[np.float32]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 _MAX_TILT = np.tan(np.deg2rad(25.0))
 

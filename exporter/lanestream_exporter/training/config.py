@@ -10,8 +10,8 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_va
 from lanestream_exporter.alexnet import Shape
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
 from lanestream_exporter.datasets.manifest import SHIPPED_MANIFEST
-from lanestream_exporter.samples.augment import Augmentation, Corruptions, Share
-from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, read_toml
+from lanestream_exporter.samples.augment import Augmentation, Corruptions
+from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, Share, read_toml
 
 
 class AdamW(Section):
