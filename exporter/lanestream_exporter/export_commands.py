@@ -15,7 +15,7 @@ from lanestream.detection.patches import PatchGeometry
 from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
 from lanestream_exporter.alexnet import FULL
-from lanestream_exporter.datasets.splits import data_root
+from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
@@ -24,7 +24,6 @@ from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import NORMALIZATIONS
 from lanestream_exporter.exporting.proof import ModelMeasurement
 from lanestream_exporter.samples.prior_regressor import prior_estimator
-from lanestream_exporter.training.config import PatchData
 
 _PATCH_KEYS = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
 
@@ -97,9 +96,7 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
     # An invalid checkpoint must fail now, not after the frames have been prepared.
     network, training = read_network(checkpoint, foreign)
     network = _with_prior(network, given["regressor"])
-    own = _own_frames(training)
-    root = data_root(given["data"]) if given["data"] and own is None else None
-    frames = ExportFrames(root, rendered=given["scenes"], own=own)
+    frames = ExportFrames(_datasets(training, given["data"]), rendered=given["scenes"])
     energy = network.default_rank_energy if given["rank_energy"] is None else given["rank_energy"]
     settings = ExportSettings(given["name"] or network.default_name, energy, given["precision"], given["tolerance"])
     _print_report(out, export_network(network, out, settings, Provenance(training, frames), click.echo), frames)
@@ -115,13 +112,15 @@ def _with_prior(network: ExportableNetwork, regressor: Path | None) -> Exportabl
     return network
 
 
-def _own_frames(training: dict[str, Any]) -> PatchData | None:
-    """Returns the user's own frames that the network was trained on; None if there were none or they are missing."""
-    data = training.get("config", {}).get("data", {})
-    paths = [frames["path"] for key in ("train", "validation") for frames in data.get(key, [])]
-    if not paths or not all(Path(path).exists() for path in paths):
-        return None
-    return PatchData.model_validate({key: data[key] for key in ("train", "validation", "validation_share")})
+def _datasets(training: dict[str, Any], data: Path | None) -> DatasetCollection | None:
+    """Returns the data sets of the manifest that a network was trained with; None if its frames are not available.
+
+    The shipped manifest is only used with a data folder, `data`.
+    """
+    manifest = training.get("config", {}).get("data", {}).get("manifest")
+    if manifest is not None and Path(manifest).is_file():
+        return DatasetCollection.open(Path(manifest), data)
+    return None if data is None else DatasetCollection.open(None, data)
 
 
 def _foreign_network(

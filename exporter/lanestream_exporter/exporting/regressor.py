@@ -28,8 +28,8 @@ from lanestream_exporter.exporting.exportable import (
 )
 from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import contrast, exporter_versions
-from lanestream_exporter.regressor import Answer, LaneRegressor
-from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.regressor import RegressorPrediction, LaneRegressor
+from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, warped_road_crop
 from lanestream_exporter.samples.road_frames import RoadFrame
 
 _MAX_TRAINING_INPUTS: Final = 1024
@@ -54,8 +54,8 @@ class ServedRegressor(nn.Module):
 
     def forward(self, road_crops: Tensor) -> Tensor:
         """Returns the served outputs; only the network itself may run in half precision."""
-        answer = Answer.of(self.network(contrast(road_crops).to(self.dtype)).float())
-        return replace(answer, presence=answer.presence / self.temperature).told()
+        answer = RegressorPrediction.of(self.network(contrast(road_crops).to(self.dtype)).float())
+        return replace(answer, presence=answer.presence / self.temperature).served()
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ExportableRegressor:
     input_name = "road_crops"
     output_name = "readings"
     # These layers have few weights and take little time, but every output depends on them to a thousandth of the width.
-    fp32_layers = ("network.features.0.", "network.hidden.", "network.shape.", "network.doubts.")
+    fp32_layers = ("network.features.0.", "network.hidden.", "network.column_head.", "network.auxiliary_head.")
     default_rank_energy = 0.99996
     guarded_metrics = ("accuracy", "presence_accuracy")
 
@@ -83,7 +83,7 @@ class ExportableRegressor:
         rng = np.random.default_rng(0)
         geometry = self.detector.geometry
         road_frames = frames.road_frames("train")
-        crops = [sample(frame, geometry, warp)[0] for frame in road_frames for warp in _warps(frame, rng)]
+        crops = [warped_road_crop(frame, geometry, warp)[0] for frame in road_frames for warp in _warps(frame, rng)]
         return np.stack([crops[i] for i in rng.permutation(len(crops))[:_MAX_TRAINING_INPUTS]])
 
     def validation_set(self, frames: ExportFrames) -> ValidationSet:
@@ -92,7 +92,7 @@ class ExportableRegressor:
         road_frames = frames.road_frames("val")
         for frame in road_frames:
             image = decode(frame.jpeg, ImageLimits())
-            target = sample(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
+            target = warped_road_crop(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
             for horizon in (frame.horizon, None):
                 prepared.append(self.detector.prepare(image, horizon))
                 targets.append((target.columns, target.known, target.presence, frame.horizon))
@@ -179,7 +179,7 @@ def _warps(frame: RoadFrame, rng: np.random.Generator) -> Iterator[Warp]:
     yield plain_warp(frame, known=True)
     yield plain_warp(frame, known=False)
     for _ in range(_WARPS_PER_FRAME):
-        yield Warp.drawn(rng)
+        yield Warp.random(rng)
 
 
 def _mean(values: NDArray[np.bool_] | NDArray[np.float64]) -> float:

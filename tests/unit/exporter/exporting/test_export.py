@@ -17,7 +17,7 @@ from lanestream.engine import load_engine
 from lanestream.errors import ExportError, ModelError
 from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
 from lanestream.inference.model_info import METADATA_KEY
-from lanestream_exporter.alexnet import AlexNet, Shape, normalise
+from lanestream_exporter.alexnet import AlexNet, Shape, normalize
 from lanestream_exporter.exporting import export
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.compression import in_batches
@@ -32,7 +32,7 @@ from lanestream_exporter.exporting.exportable import (
 from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import describe, write_graph
 from lanestream_exporter.exporting.regressor import ExportableRegressor
-from lanestream_exporter.regressor import Answer, LaneRegressor
+from lanestream_exporter.regressor import RegressorPrediction, LaneRegressor
 
 SOURCE = ExportFrames(None, rendered=4)
 PROVENANCE = Provenance({"data": "none", "step": 7}, SOURCE)
@@ -63,10 +63,10 @@ def exported(exportable: ExportableNetwork, precision: Precision, folder: Path) 
 @pytest.fixture(scope="module")
 def classifier(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     torch.manual_seed(0)
-    network = AlexNet(shape=Shape(112, 0.5, 512), normalised=False).eval()
+    network = AlexNet(shape=Shape(112, 0.5, 512), batch_norm=False).eval()
     exportable = ExportableClassifier(network, patch_geometry=PatchGeometry(112))
     # A fresh AlexNet gives nearly the same output for every patch, so its small differences are amplified.
-    logits = in_batches(lambda part: network(normalise(part)), exportable.training_inputs(SOURCE))
+    logits = in_batches(lambda part: network(normalize(part)), exportable.training_inputs(SOURCE))
     last = network.classifier[6]
     assert isinstance(last, torch.nn.Linear)
     with torch.no_grad():
@@ -117,8 +117,8 @@ def test_the_regressor_file_matches_pytorch(regressor: Exported) -> None:
     assert isinstance(exportable, ExportableRegressor)
     inputs = regressor.validation.inputs
     with torch.inference_mode():
-        answer = Answer.of(exportable.network(normalise(torch.from_numpy(inputs))))
-    expected = replace(answer, presence=answer.presence / exportable.calibration.temperature).told().numpy()
+        answer = RegressorPrediction.of(exportable.network(normalize(torch.from_numpy(inputs))))
+    expected = replace(answer, presence=answer.presence / exportable.calibration.temperature).served().numpy()
     np.testing.assert_allclose(OnnxModel.load(regressor.path, "cpu").run(inputs), expected, atol=1e-4)
     assert regressor.report.written is regressor.report.fp32
     assert regressor.report.time_ratio is None
@@ -150,7 +150,7 @@ def test_the_regressors_small_layers_stay_in_fp32_in_an_int8_file(regressor: Exp
     export.quantize(regressor.path, small, regressor.validation.inputs, exportable.fp32_layers)
     weights = {tensor.name: tensor.data_type for tensor in onnx.load(str(small)).graph.initializer}
     floats = [name for name, kind in weights.items() if kind == onnx.TensorProto.FLOAT and name.endswith("weight")]
-    assert {name.split(".")[1] for name in floats} == {"features", "hidden", "shape", "doubts"}
+    assert {name.split(".")[1] for name in floats} == {"features", "hidden", "column_head", "auxiliary_head"}
     assert [name for name in floats if ".features." in name] == ["network.features.0.weight"]
     info = OnnxModel.load(regressor.path, "cpu").info
     describe(small, info)

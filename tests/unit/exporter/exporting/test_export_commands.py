@@ -8,6 +8,7 @@ import pytest
 import torch
 from click import UsageError
 from click.testing import CliRunner, Result
+from labelfiles import write_manifest
 
 from lanestream.detection import Prepared
 from lanestream.detection.patches import PatchGeometry
@@ -98,7 +99,7 @@ def test_the_table_compares_size_accuracy_and_time(tmp_path: Path, capsys: pytes
         ModelMeasurement("int8", {"accuracy": 0.947, "average_precision": 0.98}, 1e-3, 5e-2, 3_000_000, 1.2),
     ]
     with torch.device("meta"):
-        network = ExportableClassifier(AlexNet(normalised=False))
+        network = ExportableClassifier(AlexNet(batch_norm=False))
     report = ExportReport(network, 20, 300, *rows, BoundaryComparison(80, 1, 0.1, 2.5), "openvino")
     out = tmp_path / "out.onnx"
     out.write_bytes(bytes(1234))  # the metrics are written into the file after it has been measured
@@ -118,7 +119,10 @@ def test_own_frames_verify_the_file_if_they_still_exist(tmp_path: Path) -> None:
     data = {"train": [{"path": str(tmp_path), "format": "auto"}], "validation": [], "validation_share": 0.25}
     found = export_commands._own_frames({"config": {"data": data}})
     assert found is not None
-    assert (found.train[0].path, found.validation_share) == (str(tmp_path), 0.25)
-    data["train"] = [{"path": str(tmp_path / "gone"), "format": "auto"}]
-    assert export_commands._own_frames({"config": {"data": data}}) is None
-    assert export_commands._own_frames({"data": "not recorded"}) is None
+    assert (found.manifest.dataset[0].name, found.root) == ("mine", tmp_path)
+    gone = {"config": {"data": {"manifest": str(tmp_path / "gone.toml")}}}
+    assert export_commands._datasets(gone, None) is None
+    assert export_commands._datasets({"data": "not recorded"}, None) is None
+    shipped = export_commands._datasets({"data": "not recorded"}, tmp_path)
+    assert shipped is not None
+    assert shipped.root == tmp_path

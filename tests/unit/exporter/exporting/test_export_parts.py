@@ -16,7 +16,7 @@ from lanestream.errors import ExportError
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection
 from lanestream.road.view import RoadView
-from lanestream_exporter.alexnet import AlexNet, normalise
+from lanestream_exporter.alexnet import AlexNet, normalize
 from lanestream_exporter.exporting import proof
 from lanestream_exporter.exporting.compression import truncate_layers
 from lanestream_exporter.exporting.exportable import Calibration, ValidationSet, fit_calibration
@@ -50,13 +50,13 @@ def network() -> AlexNet:
 @torch.inference_mode()
 def test_folding_keeps_the_function_and_removes_the_normalization(network: AlexNet, patches: NDArray[np.uint8]) -> None:
     plain = network.folded()
-    x = normalise(torch.from_numpy(patches[:4]))
+    x = normalize(torch.from_numpy(patches[:4]))
     torch.testing.assert_close(plain(x), network(x), rtol=1e-3, atol=1e-4)
     assert not [key for key in plain.state_dict() if key.startswith("norms.")]
 
 
 def test_the_plain_network_has_torchvisions_keys_and_shapes() -> None:
-    shapes = {key: tuple(value.shape) for key, value in AlexNet(1000, normalised=False).state_dict().items()}
+    shapes = {key: tuple(value.shape) for key, value in AlexNet(1000, batch_norm=False).state_dict().items()}
     assert shapes["features.0.weight"] == (64, 3, 11, 11)
     assert shapes["features.10.weight"] == (256, 256, 3, 3)
     assert shapes["classifier.1.weight"] == (4096, 9216)
@@ -102,13 +102,13 @@ def test_truncation_keeps_layers_that_it_would_not_shrink(layers: nn.Sequential)
 @torch.inference_mode()
 def test_brightness_and_contrast_of_a_patch_are_normalized_away(patches: NDArray[np.uint8]) -> None:
     dim = (patches[:2].astype(np.float32) * 0.5 + 20.0).astype(np.uint8)
-    difference = normalise(torch.from_numpy(dim)) - normalise(torch.from_numpy(patches[:2]))
+    difference = normalize(torch.from_numpy(dim)) - normalize(torch.from_numpy(patches[:2]))
     assert difference.abs().mean().item() < 0.1
 
 
 def test_the_served_normalization_matches_training(patches: NDArray[np.uint8]) -> None:
     images = torch.from_numpy(np.concatenate([patches[:6], patches[:2] // 50, np.full_like(patches[:1], 77)]))
-    torch.testing.assert_close(contrast(images), normalise(images), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(contrast(images), normalize(images), rtol=1e-4, atol=1e-5)
 
 
 def test_the_imagenet_normalization_matches_torchvision() -> None:
