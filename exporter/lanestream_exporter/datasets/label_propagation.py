@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from lanestream.detection.commonroad import CommonRoad
 
-from lanestream.detection.curve_fit import Refinement
-from lanestream.road.curve import Curve, FloatArray
-from lanestream.road.results import Candidate
-from lanestream.road.view import Image, RoadView
+from lanestream.detection.curve_fit import FitSettings, fit_curves
+from lanestream.detection.features import paint_gray
+from lanestream.images.resizing import working_image
+from lanestream.road.curve import Curve, Curves, FloatArray
+from lanestream.road.view import Image, RoadView, Scaling, Spans
 from lanestream_exporter.datasets.horizons import drive_horizons
 from lanestream_exporter.datasets.images import ImageLocation, ImageReader
 from lanestream_exporter.datasets.labels import PARTIAL, LabelledFrame, LabelledImages, LabelledLane, fitted_curve
@@ -29,8 +29,8 @@ from lanestream_exporter.datasets.labels import PARTIAL, LabelledFrame, Labelled
 # Boundaries are not fitted closer to the horizon than this share of the rows below it.
 _TOP_SHARE: Final = 0.06
 
-# The shares of the rows below the horizon at which a curve is resampled for another horizon.
-_ANCHORS: Final = np.array([1.0, 0.45, 0.15])
+# The horizon is that between the two labeled frames: a drift of the boundaries must not move it.
+_FIT: Final = FitSettings(move_horizon=False)
 
 # Points of a propagated label; the two passes are compared at the same rows.
 _POINTS: Final = 18
@@ -47,12 +47,11 @@ class LabelPropagation:
     stride: int = 5
     longest: int = 60
     agreement: float = 6.0
-    refinement: Refinement = Refinement(road=CommonRoad(nod=0.0))
 
     def frames(self, video: Path, labelled: Mapping[int, LabelledFrame]) -> LabelledImages:
         """Yields labeled frames between those of `labelled` (by index in the video) with their BGR images (H, W, 3).
 
-        Frames on which no boundary can be labeled are left out. Raises SourceError if the video can't be read.
+        Both are at the working width, at which boundaries are fitted. Frames on which no boundary can be labeled are left out. Raises SourceError if the video can't be read.
         """
         indices = sorted(labelled)
         horizons = drive_horizons([labelled[index] for index in indices])
@@ -76,41 +75,24 @@ class LabelPropagation:
             return
         shares = np.linspace(0.0, 1.0, len(images))
         steps = [_Step.interpolate(first, last, ids, float(share)) for share in shares]
-        forward = self._fit_pass([first.boundaries[lane_id].curve for lane_id in ids], steps, images)
-        backward = self._fit_pass([last.boundaries[lane_id].curve for lane_id in ids], steps[::-1], images[::-1])[::-1]
+        forward = _fit_pass(first.curves(ids), steps, images)
+        backward = _fit_pass(last.curves(ids), steps[::-1], images[::-1])[::-1]
         complete = first.complete and last.complete and len(first.boundaries) == len(last.boundaries) == len(ids)
         for number in range(self.stride, len(images) - 1, self.stride):
             nearer = first if shares[number] <= 0.5 else last
+            passes = zip(ids, forward[number], backward[number], strict=True)
             labels = [
-                self._label(nearer.boundaries[lane_id].lane, passes, rows, steps[number])
-                for lane_id, *passes, rows in zip(
-                    ids, forward[number], backward[number], steps[number].row_ranges, strict=True
-                )
+                self._label(nearer.boundaries[lane_id].lane, (one, other), steps[number], index)
+                for index, (lane_id, one, other) in enumerate(passes)
             ]
             lanes = tuple(lane for lane in labels if lane is not None)
             if lanes:
                 coverage = nearer.frame.coverage if complete and len(lanes) == len(ids) else PARTIAL
                 yield first.index + number, replace(nearer.frame, lanes=lanes, coverage=coverage), images[number]
 
-    def _fit_pass(
-        self, curves: Sequence[Curve], steps: Sequence[_Step], images: Sequence[Image]
-    ) -> list[Sequence[Curve]]:
-        """Returns the `curves` of the first image in every image, each fitted from the previous image's."""
-        fitted = [curves]
-        for image, step in zip(images[1:], steps[1:], strict=True):
-            candidates = [
-                Candidate(_resampled(curve, step.view), max(top, step.view.row_at(_TOP_SHARE)), bottom, 1.0)
-                for curve, (top, bottom) in zip(fitted[-1], step.row_ranges, strict=True)
-            ]
-            fits, _ = self.refinement.refine(image, candidates, step.view)
-            fitted.append([fit.curve for fit in fits])
-        return fitted
-
-    def _label(
-        self, lane: LabelledLane, passes: Sequence[Curve], row_range: tuple[float, float], step: _Step
-    ) -> LabelledLane | None:
+    def _label(self, lane: LabelledLane, passes: tuple[Curve, Curve], step: _Step, index: int) -> LabelledLane | None:
         """Returns the mean of both passes as a label like `lane`; None if they disagree or little of it is visible."""
-        rows = np.linspace(*row_range[::-1], _POINTS)
+        rows = np.linspace(step.spans.bottom[index], step.spans.top[index], _POINTS)
         forward, backward = (curve.x(rows) for curve in passes)
         distance = np.abs(forward - backward) / np.hypot(1.0, passes[0].slope(rows))
         if distance.mean() > self.agreement * step.view.width / 1280.0:
@@ -118,6 +100,17 @@ class LabelPropagation:
         points = np.stack([0.5 * (forward + backward), rows], axis=1)
         inside = points[(points[:, 0] >= 0.0) & (points[:, 0] <= step.view.width - 1.0)]
         return replace(lane, points=inside) if len(inside) >= _POINTS // 3 else None
+
+
+def _fit_pass(curves: Curves, steps: Sequence[_Step], images: Sequence[Image]) -> list[Curves]:
+    """Returns the `curves` of the first image in every image, each fitted from the previous image's."""
+    fitted = [curves]
+    for image, step in zip(images[1:], steps[1:], strict=True):
+        view = step.view
+        spans = replace(step.spans, top=np.maximum(step.spans.top, view.row_at(_TOP_SHARE)))
+        start = fitted[-1].below(view.horizon, view.bottom)
+        fitted.append(fit_curves(paint_gray(image), start, spans, view, _FIT).curves)
+    return fitted
 
 
 @dataclass(frozen=True)
@@ -132,17 +125,24 @@ class _KeyBoundary:
 class _KeyFrame:
     """A labeled frame at one end of a stretch: its boundaries by lane id, without ids that are not unique.
 
-    `complete` says that these are all labels of the frame.
+    All is in pixels of working images; `horizon` is the row in the frame's own pixels. `complete` says that these are all labels of the frame.
     """
 
     def __init__(self, index: int, frame: LabelledFrame, horizon: float) -> None:
-        self.index, self.frame = index, frame
-        self.view = RoadView(frame.width, frame.height, horizon)
-        counts = Counter(lane.lane_id for lane in frame.lanes)
-        unique = {lane.lane_id: lane for lane in frame.lanes if lane.lane_id is not None and counts[lane.lane_id] == 1}
+        horizon = Scaling.to_working_width(frame.width).to_working(horizon)
+        self.index, self.frame = index, frame.at_working_width
+        self.view = RoadView(self.frame.width, self.frame.height, horizon)
+        counts = Counter(lane.lane_id for lane in self.frame.lanes)
+        unique = {
+            lane.lane_id: lane for lane in self.frame.lanes if lane.lane_id is not None and counts[lane.lane_id] == 1
+        }
         boundaries = {lane_id: self._boundary(lane) for lane_id, lane in unique.items()}
         self.boundaries = {lane_id: found for lane_id, found in boundaries.items() if found is not None}
         self.complete = len(self.boundaries) == len(frame.lanes)
+
+    def curves(self, ids: Sequence[int]) -> Curves:
+        """Returns the boundaries with these ids."""
+        return Curves.of([self.boundaries[lane_id].curve for lane_id in ids])
 
     def _boundary(self, lane: LabelledLane) -> _KeyBoundary | None:
         points = lane.points[lane.points[:, 1] > self.view.row_at(_TOP_SHARE)]
@@ -154,37 +154,27 @@ class _KeyFrame:
 
 @dataclass(frozen=True)
 class _Step:
-    """A frame between two key frames: its approximate horizon, and the (top, bottom) rows of each boundary there."""
+    """A frame between two key frames: its approximate horizon, and the rows of each boundary there."""
 
     view: RoadView
-    row_ranges: tuple[tuple[float, float], ...]
+    spans: Spans
 
     @classmethod
     def interpolate(cls, first: _KeyFrame, last: _KeyFrame, ids: Sequence[int], share: float) -> _Step:
         """Returns the frame at `share` (0 to 1) of the way from `first` to `last`."""
-        horizon = _mix(first.view.horizon, last.view.horizon, share)
-        pairs = [(first.boundaries[lane_id].rows, last.boundaries[lane_id].rows) for lane_id in ids]
-        rows = [(_mix(a[0], b[0], share), _mix(a[1], b[1], share)) for a, b in pairs]
-        return cls(replace(first.view, horizon=horizon), tuple(rows))
-
-
-def _mix(first: float, last: float, share: float) -> float:
-    return first + share * (last - first)
-
-
-def _resampled(curve: Curve, view: RoadView) -> Curve:
-    """Returns the same curve expressed under the horizon of `view`."""
-    rows: FloatArray = view.horizon + _ANCHORS * view.depth
-    return Curve.through(view.horizon, rows, curve.x(rows))
+        rows: FloatArray = np.array([[key.boundaries[lane_id].rows for lane_id in ids] for key in (first, last)])
+        top, bottom = (rows[0] + share * (rows[1] - rows[0])).T
+        horizon = first.view.horizon + share * (last.view.horizon - first.view.horizon)
+        return cls(first.view.with_horizon(horizon), Spans(top, bottom, np.ones(len(ids), bool)))
 
 
 def _read_stretches(video: Path, stretches: Sequence[tuple[int, int]]) -> Iterator[list[Image]]:
-    """Yields the images of each stretch (first index, last index) of a video, both included."""
+    """Yields the working images of each stretch (first index, last index) of a video, both included."""
     images: dict[int, Image] = {}
     with ImageReader() as reader:
         for first, last in stretches:
             # The end of one stretch is usually the start of the next, and a video is decoded forwards.
             images = {index: image for index, image in images.items() if index >= first}
             for index in range(first + len(images), last + 1):
-                images[index] = reader.open(ImageLocation(video, index))
+                images[index] = working_image(reader.open(ImageLocation(video, index)))[0]
             yield list(images.values())

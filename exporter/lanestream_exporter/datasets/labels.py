@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lanestream.images.resizing import working_image
 from lanestream.road.curve import Curve, FloatArray, curve_basis
-from lanestream.road.view import Image, RoadView
+from lanestream.road.view import WORKING_WIDTH, Image, RoadView, Scaling
 
 # How far, in pixels, a labeler's point may lie outside the image or go back down the boundary by mistake.
 POINT_TOLERANCE: Final = 1.0
@@ -64,6 +64,13 @@ class LabelledFrame:
     source: str
     coverage: Coverage = PARTIAL
 
+    @property
+    def at_working_width(self) -> LabelledFrame:
+        """The same labels in pixels of the working image, which detectors see."""
+        scaling = Scaling.to_working_width(self.width)
+        lanes = tuple(replace(lane, points=scaling.to_working(lane.points)) for lane in self.lanes)
+        return replace(self, width=WORKING_WIDTH, height=max(1, round(scaling.factor * self.height)), lanes=lanes)
+
     def open_to(self, side: int) -> bool:
         """Whether a boundary beyond the outermost label on `side` (-1 left, 1 right) is unknown rather than absent.
 
@@ -78,11 +85,8 @@ LabelledImages = Iterator[tuple[LabelledFrame, Image]]
 
 
 def to_working(frame: LabelledFrame, image: Image) -> tuple[LabelledFrame, Image]:
-    """Returns a labeled frame and its BGR image (H, W, 3) uint8 at the working width, which detectors see."""
-    working, scaling = working_image(image)
-    height, width = working.shape[:2]
-    lanes = tuple(replace(lane, points=scaling.to_working(lane.points)) for lane in frame.lanes)
-    return replace(frame, width=width, height=height, lanes=lanes), working
+    """Returns a labeled frame and its BGR image (H, W, 3) uint8 at the working width."""
+    return frame.at_working_width, working_image(image)[0]
 
 
 def points_of(value: object) -> FloatArray:
