@@ -11,9 +11,9 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from lanestream.detection.patches import PatchGeometry
 from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
+from lanestream.road.crops import PatchGeometry
 from lanestream_exporter.alexnet import FULL
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
@@ -23,9 +23,9 @@ from lanestream_exporter.exporting.exportable import ExportableNetwork, Precisio
 from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import NORMALIZATIONS
 from lanestream_exporter.exporting.proof import ModelMeasurement
-from lanestream_exporter.samples.prior_regressor import prior_estimator
+from lanestream_exporter.samples.prior_regressor import load_prior_regressor
 
-_PATCH_KEYS = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
+_PATCH_KEYS = {"size": int, "half_width": float, "min_half_width": float, "obliquity": float}
 
 
 def _classes(_context: click.Context, _option: click.Parameter, value: str | None) -> tuple[str, ...] | None:
@@ -45,7 +45,7 @@ def _patch_geometry(_context: click.Context, _option: click.Parameter, value: st
             given[key] = _PATCH_KEYS[key](number)
         except ValueError:
             raise click.BadParameter(f"{key} must be a number, not {number!r}") from None
-        if not (0 < given[key] < math.inf or (key == "lean" and given[key] == 0)):
+        if not (0 < given[key] < math.inf or (key == "obliquity" and given[key] == 0)):
             raise click.BadParameter(f"{key} must be above 0")
     return PatchGeometry(**given)
 
@@ -106,7 +106,7 @@ def _with_prior(network: ExportableNetwork, regressor: Path | None) -> Exportabl
     """Returns a classifier with the prior of `regressor`, as it is served; returns a regressor unchanged."""
     if isinstance(network, ExportableClassifier):
         path = resolve_regressor(regressor)
-        return network if path is None else replace(network, prior_estimator=prior_estimator(path))
+        return network if path is None else replace(network, prior=load_prior_regressor(path))
     if regressor is not None:
         raise click.UsageError("--regressor is only for classifiers; CHECKPOINT is a regressor")
     return network

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from lanestream.detection.regression_detector import ANCHORS
+from lanestream.detection.ego_prior import REGRESSOR_ANCHORS
 from lanestream_exporter.alexnet import FULL, AlexNet, Shape
 from lanestream_exporter.samples.road_crops import SHARES
 
@@ -96,7 +96,7 @@ class RegressorPrediction:
         return cls(raw[:, :6].view(-1, 2, 3) + typical, logs, raw[:, 12:14], raw[:, 14])
 
     def served(self) -> Tensor:
-        """Returns outputs (N, 15) in the layout of `lanestream.detection.regression_detector.RegressorOutput`."""
+        """Returns outputs (N, 15) in the layout of `lanestream.detection.ego_prior.RegressorOutput`."""
         return torch.cat(
             [
                 self.columns.flatten(1),
@@ -110,13 +110,13 @@ class RegressorPrediction:
 
 def at_shares() -> Tensor:
     """Returns the matrix (S, 3) from columns at the anchors to columns at `SHARES` of the rows below the horizon."""
-    basis = [np.stack([np.ones(len(s)), s, 1.0 / s], axis=1) for s in (np.array(SHARES), np.array(ANCHORS))]
+    basis = [np.stack([np.ones(len(s)), s, 1.0 / s], axis=1) for s in (np.array(SHARES), REGRESSOR_ANCHORS)]
     return torch.tensor(basis[0] @ np.linalg.inv(basis[1]), dtype=torch.float32)
 
 
 def logs_at_shares() -> Tensor:
     """Returns the matrix (S, 3) that interpolates logarithms from the anchors to `SHARES`, linearly in log shares."""
-    anchors = np.log(np.array(ANCHORS))[::-1]
+    anchors = np.log(REGRESSOR_ANCHORS)[::-1]
     rows = [np.interp(np.log(np.array(SHARES)), anchors, np.eye(3)[::-1][:, i]) for i in range(3)]
     return torch.tensor(np.stack(rows, axis=1), dtype=torch.float32)
 

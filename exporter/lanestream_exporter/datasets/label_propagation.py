@@ -51,7 +51,8 @@ class LabelPropagation:
     def frames(self, video: Path, labelled: Mapping[int, LabelledFrame]) -> LabelledImages:
         """Yields labeled frames between those of `labelled` (by index in the video) with their BGR images (H, W, 3).
 
-        Both are at the working width, at which boundaries are fitted. Frames on which no boundary can be labeled are left out. Raises SourceError if the video can't be read.
+        Both are at the working width, at which boundaries are fitted. Frames on which no boundary can be labeled are
+        left out. Raises SourceError if the video can't be read.
         """
         indices = sorted(labelled)
         horizons = drive_horizons([labelled[index] for index in indices])
@@ -125,7 +126,8 @@ class _KeyBoundary:
 class _KeyFrame:
     """A labeled frame at one end of a stretch: its boundaries by lane id, without ids that are not unique.
 
-    All is in pixels of working images; `horizon` is the row in the frame's own pixels. `complete` says that these are all labels of the frame.
+    All is in pixels of working images; the `horizon` that it is made with is in pixels of the frame. `complete` says
+    that these are all labels of the frame.
     """
 
     def __init__(self, index: int, frame: LabelledFrame, horizon: float) -> None:

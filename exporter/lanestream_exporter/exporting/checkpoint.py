@@ -11,8 +11,8 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from lanestream.detection.patches import PatchGeometry
 from lanestream.errors import CheckpointError
+from lanestream.road.crops import PatchGeometry
 from lanestream_exporter.alexnet import FULL, AlexNet, Shape, load_state
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.exportable import ExportableNetwork

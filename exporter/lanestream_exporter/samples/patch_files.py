@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,19 +13,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.ego_prior import EgoPriorEstimator
-from lanestream.detection.patches import PatchCutter, PatchGeometry
-from lanestream.detection.proposals import CandidateSearch
+from lanestream.detection.proposals import MOST_CANDIDATES
 from lanestream.errors import LabelError
-from lanestream.road.view import RoadView
-from lanestream_exporter.datasets.labels import LabelledImages
+from lanestream.road.crops import PatchGeometry
+from lanestream.road.view import RoadView, Scaling
+from lanestream_exporter.datasets.labels import LabelledImages, to_working
 from lanestream_exporter.samples.cache import scene_files
 from lanestream_exporter.samples.patches import PatchMaker
-from lanestream_exporter.samples.prior_regressor import prior_estimator
+from lanestream_exporter.samples.prior_regressor import PriorRegressor, load_prior_regressor
 from lanestream_exporter.scenes import render_still, sample_scene
 
 # How often the labels of a frame to train on are jittered.
 _JITTER_ROUNDS = 5
+
+# More candidates of a frame to train on than are served: the weaker ones are real negatives, which are scarce.
+_MOST_TO_TRAIN = 32
 
 # Sizes of rendered stills and how often each is drawn: cameras differ, and so does the sharpness of a patch.
 _SIZES = ((640, 360), (640, 480), (960, 540), (1280, 720))
@@ -113,10 +116,8 @@ class PatchCache:
         path = self.folder / f"{name}-{self._kind}.npz"
         if not path.exists():
             self.folder.mkdir(parents=True, exist_ok=True)
-            # More candidates than are served: the weaker ones are real negatives, which are scarce.
-            search = CandidateSearch(limit=32) if to_train else CandidateSearch()
-            cutter = PatchCutter(PatchGeometry(self.size))
-            maker = PatchMaker(search, cutter, prior_estimator=_prior_or_none(self.regressor))
+            limit = _MOST_TO_TRAIN if to_train else MOST_CANDIDATES
+            maker = PatchMaker(PatchGeometry(self.size), _prior_or_none(self.regressor), limit)
             write_store(path, _labelled_patches(maker, frames(), to_train))
         return path
 
@@ -125,16 +126,16 @@ class PatchCache:
         """The part of the file names that differs by patch size and regressor."""
         if self.regressor is None:
             return f"{self.size}"
-        prior_estimator(self.regressor)  # reports a bad file here rather than in another process
+        load_prior_regressor(self.regressor)  # reports a bad file here rather than in another process
         return f"{self.size}-prior-{hashlib.sha256(self.regressor.read_bytes()).hexdigest()[:8]}"
 
 
-def _prior_or_none(regressor: Path | None) -> EgoPriorEstimator | None:
-    return None if regressor is None else prior_estimator(regressor)
+def _prior_or_none(regressor: Path | None) -> PriorRegressor | None:
+    return None if regressor is None else load_prior_regressor(regressor)
 
 
 def _write_rendered(size: int, regressor: Path | None, number: int, scenes: int, path: Path) -> None:
-    maker = PatchMaker(cutter=PatchCutter(PatchGeometry(size)), prior_estimator=_prior_or_none(regressor))
+    maker = PatchMaker(PatchGeometry(size), _prior_or_none(regressor))
     write_store(path, _rendered_patches(maker, number, scenes))
 
 
@@ -143,15 +144,16 @@ def _rendered_patches(maker: PatchMaker, number: int, scenes: int) -> Iterator[t
         rng = np.random.default_rng([number, index])
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
         still = render_still(sample_scene(rng, width, height))
-        view = RoadView(width, height, still.horizon)
-        yield from maker.all_of(still.image, still.labels, view, rng)
+        labels, image = to_working(still.labels, still.image)
+        horizon = Scaling.to_working_width(width).to_working(still.horizon)
+        yield from maker.all_of(image, labels, RoadView(labels.width, labels.height, horizon), rng)
 
 
 def _labelled_patches(
     maker: PatchMaker, frames: LabelledImages, to_train: bool
 ) -> Iterator[tuple[NDArray[np.uint8], int]]:
     clear = partial(filter, lambda item: item[1] in (0, 1))
-    for number, (frame, image) in enumerate(frames):
+    for number, (frame, image) in enumerate(itertools.starmap(to_working, frames)):
         rng = np.random.default_rng([number, 1])
         proposals = maker.propose(image)
         yield from clear(zip(*maker.proposed(image, frame, proposals), strict=True))

@@ -121,17 +121,12 @@ class PatchMaker:
     """
 
     def __init__(
-        self,
-        geometry: PatchGeometry = PatchGeometry(),
-        prior: PriorRegressor | None = None,
-        limit: int = MOST_CANDIDATES,
-        rule: TruthRule = TruthRule(),
+        self, geometry: PatchGeometry, prior: PriorRegressor | None = None, limit: int = MOST_CANDIDATES
     ) -> None:
         # The threshold decides nothing here: patches of all candidates are cut.
         self._detector = CandidateDetector(0.5, geometry, None if prior is None else prior.regressor)
         self._infer = no_regressor if prior is None else prior.infer
         self._limit = limit
-        self._rule = rule
 
     def propose(self, image: Image) -> Proposals:
         """Returns the candidates of a BGR working image with an unknown horizon, as of a stream's first frame."""
@@ -164,7 +159,7 @@ class PatchMaker:
                     yield patch, int(verdict)
 
     def _labelled(self, image: Image, frame: LabelledFrame, curves: Curves, spans: Spans, view: RoadView) -> Patches:
-        verdicts = self._rule.judge(curves, spans, view, frame)
+        verdicts = TruthRule().judge(curves, spans, view, frame)
         return cut_patches(image, curves, spans, view, self._detector.patch), verdicts
 
 

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.regression_detector import HORIZONS, RoadCropGeometry
+from lanestream.detection.ego_prior import UNKNOWN_HORIZONS
+from lanestream.road.crops import FloatMap, RoadCropGeometry
 from lanestream.road.curve import FloatArray
 from lanestream.road.view import RoadView
 from lanestream_exporter.samples.road_frames import RoadFrame
@@ -94,11 +95,11 @@ def warped_road_crop(
 def plain_warp(frame: RoadFrame, known: bool) -> Warp:
     """Returns no warp, with the true horizon if `known`, else the closest of the horizons tried on a new camera."""
     depth = frame.height - 1.0 - frame.horizon
-    tried = [(share * frame.height - frame.horizon) / depth for share in HORIZONS]
+    tried = [(share * frame.height - frame.horizon) / depth for share in UNKNOWN_HORIZONS]
     return Warp(assumed=0.0 if known else min(tried, key=abs))
 
 
-def _source(columns: FloatArray, rows: FloatArray, view: RoadView, warp: Warp) -> tuple[FloatArray, FloatArray]:
+def _source(columns: FloatMap, rows: FloatMap, view: RoadView, warp: Warp) -> tuple[FloatMap, FloatMap]:
     """Returns where in the frame a pixel of the warped image comes from: the changes undone, last one first."""
     center = (view.width - 1) / 2.0
     x = 2.0 * center - columns if warp.flipped else columns

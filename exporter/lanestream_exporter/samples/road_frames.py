@@ -1,4 +1,4 @@
-"""Small frames for the regressor: images at its working width, with boundaries and horizon."""
+"""Small frames for the regressor: images at its detail width, with boundaries and horizon."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lanestream.detection.features import resized
-from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.errors import LabelError
+from lanestream.images.resizing import resized, working_image
+from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import FloatArray
-from lanestream.road.view import Image, Scaling
+from lanestream.road.view import WORKING_WIDTH, Image, Scaling
 from lanestream_exporter.datasets.horizons import shared_horizon
 from lanestream_exporter.datasets.labels import LabelledFrame, LabelledImages, LabelledLane
 from lanestream_exporter.samples.cache import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
 
+# The regressor warps images of this width.
+_DETAIL_WIDTH = RoadCropGeometry.detail_width
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
 _SIZES = ((448, 252), (448, 336), (640, 360))
 _SHARES = (0.5, 0.35, 0.15)
@@ -48,13 +50,10 @@ class RoadFrame:
     @classmethod
     def of(cls, frame: LabelledFrame, image: Image, expected_horizon: float | None = None) -> RoadFrame | None:
         """Returns a labeled frame made small; None if its labels don't determine a horizon and none is expected."""
-        scaling = Scaling(min(1.0, RegressionDetector.detail_width / frame.width))
-        lanes = tuple(
-            np.stack([(lane.points[:, i] + 0.5) * scaling.factor - 0.5 for i in (0, 1)], axis=1)
-            for lane in frame.lanes
-            if len(lane.points) >= 3
-        )
-        small = resized(image, scaling)
+        scaling = Scaling(min(1.0, _DETAIL_WIDTH / frame.width))
+        lanes = tuple(scaling.to_working(lane.points) for lane in frame.lanes if len(lane.points) >= 3)
+        # As the regressor does in service: to the working width first.
+        small = image if scaling.factor == 1.0 else resized(working_image(image)[0], _DETAIL_WIDTH / WORKING_WIDTH)
         height, width = small.shape[:2]
         expected = None if expected_horizon is None else scaling.to_working(expected_horizon)
         horizon = shared_horizon(lanes, height, expected)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lanestream.errors import LabelError
-from lanestream.processors import processors
+from lanestream.host import processors
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.samples.cache import scenes_per_file
 from lanestream_exporter.samples.patch_files import PatchCache, PatchStore, read_stores

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lanestream.detection.regression_detector import RoadCropGeometry
 from lanestream.errors import CheckpointError
+from lanestream.road.crops import RoadCropGeometry
 from lanestream_exporter.alexnet import load_state, normalize
 from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction, at_shares, lateral_loss
 from lanestream_exporter.samples.augment import corrupted

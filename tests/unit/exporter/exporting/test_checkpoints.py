@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from lanestream.detection.patches import PatchGeometry
 from lanestream.errors import CheckpointError
+from lanestream.road.crops import PatchGeometry
 from lanestream_exporter.alexnet import AlexNet, Shape, load_torchvision_weights
 from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
 from lanestream_exporter.exporting.classifier import ExportableClassifier

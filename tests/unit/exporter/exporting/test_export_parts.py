@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from lanestream.detection import Prepared
+from lanestream.detection.ego_prior import RoadRegressor
+from lanestream.detection.interface import FrameContext, Infer, ModelRole
 from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.errors import ExportError
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection
-from lanestream.road.view import RoadView
 from lanestream_exporter.alexnet import AlexNet, normalize
 from lanestream_exporter.exporting import proof
 from lanestream_exporter.exporting.compression import truncate_layers
@@ -135,20 +135,29 @@ def test_equal_labels_give_the_default_calibration() -> None:
 
 
 def test_boundaries_of_two_networks_are_compared_by_columns() -> None:
-    view = RoadView(640, 360, 160.0)
-    inputs = np.zeros((2, 224, 224, 3), np.uint8)
-    prepared = Prepared(np.zeros((360, 640, 3), np.uint8), (lambda: inputs,), view, looks=(view,))
-    validation = ValidationSet(2, (prepared, prepared), {})
+    image, inputs = np.zeros((360, 640, 3), np.uint8), np.zeros((2, 224, 224, 3), np.uint8)
+    validation = ValidationSet(2, (image, image), (FrameContext(160.0),) * 2, inputs, {})
+    detector = RegressionDetector(RoadRegressor(0.5))
     straight = [-0.3, -0.12, -0.05, 0.3, 0.12, 0.05, *[0.01] * 6, 0.9, 0.9, 0.0]
     both = np.array([straight, straight], np.float32)  # straight and mirrored views, which are equal here
     single = both.copy()
     single[0, 13] = single[1, 12] = 0.0
-    same, other = (np.concatenate([both, part]) for part in (both, single))
-    found = compare_boundaries(RegressionDetector(), validation, same, other)
+    found = compare_boundaries(detector, validation, returning(both, both), returning(both, single))
     assert (found.matched, found.unmatched) == (3, 1)
     assert 0.0 < found.mean < found.largest  # a boundary fitted alone differs from one fitted jointly
-    equal = compare_boundaries(RegressionDetector(), validation, same, same)
+    equal = compare_boundaries(detector, validation, returning(both, both), returning(both, both))
     assert (equal.matched, equal.unmatched, equal.mean, equal.largest) == (4, 0, 0.0, 0.0)
+
+
+def returning(*outputs: NDArray[np.float32]) -> Infer:
+    """Returns a network with these outputs, one after the other."""
+    remaining = iter(outputs)
+
+    def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        assert (role, len(inputs)) == ("regressor", 2)
+        return next(remaining)
+
+    return infer
 
 
 def test_only_close_boundaries_are_matched() -> None:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from lanestream.errors import LabelError
-from lanestream.road.curve import Curve
-from lanestream.road.results import Candidate
-from lanestream.road.view import RoadView
+from lanestream.road.curve import Curve, Curves
+from lanestream.road.view import RoadView, Scaling, Spans
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_labels, match
@@ -34,8 +33,11 @@ def frame(*lanes: LabelledLane, coverage: Coverage = PARTIAL) -> LabelledFrame:
     return LabelledFrame(1280, 720, lanes, "clip", "clip#0", coverage)
 
 
-def candidate(b: float, v: float = 640.0) -> Candidate:
-    return Candidate(curve(b, v), 342.0, 719.0, 1.0)
+def judge(*curves: Curve, labels: LabelledFrame, top: float = 342.0) -> list[int]:
+    """Returns the verdicts on candidates that are visible from the row `top` down."""
+    number = len(curves)
+    spans = Spans(np.full(number, top), np.full(number, 719.0), np.ones(number, bool))
+    return TruthRule().judge(Curves.of(curves), spans, VIEW, labels).tolist()
 
 
 @pytest.mark.parametrize(
@@ -50,13 +52,25 @@ def candidate(b: float, v: float = 640.0) -> Candidate:
     ],
 )
 def test_verdicts(b: float, v: float, verdict: int) -> None:
-    rule, labels = TruthRule(), frame(label(-1.1), label(1.1))
-    assert rule.judge([candidate(b, v)], labels, VIEW).tolist() == [verdict]
+    assert judge(curve(b, v), labels=frame(label(-1.1), label(1.1))) == [verdict]
+
+
+def test_verdicts_do_not_depend_on_the_size_of_the_frame() -> None:
+    labels = frame(label(-1.1), label(1.1))
+    scaling = Scaling.to_working_width(1280)
+    working = labels.at_working_width
+    assert (working.width, working.height) == (640, 360)
+    view = RoadView(640, 360, scaling.to_working(VIEW.horizon))
+    places = (640.0, 650.0, 668.0, 720.0)
+    curves = Curves.of([scaling.curve_to_working(curve(-1.1, v)) for v in places])
+    spans = Spans(np.full(4, scaling.to_working(342.0)), np.full(4, 359.0), np.ones(4, bool))
+    verdicts = TruthRule().judge(curves, spans, view, working).tolist()
+    assert verdicts == judge(*(curve(-1.1, v) for v in places), labels=labels) == [TRUE, TRUE, UNSURE, FALSE]
 
 
 def test_beyond_the_labels_of_a_completely_labeled_frame_a_candidate_is_false() -> None:
     labels = frame(label(-1.1), label(1.1), coverage=WHOLE)
-    assert TruthRule().judge([candidate(2.5)], labels, VIEW).tolist() == [FALSE]
+    assert judge(curve(2.5), labels=labels) == [FALSE]
 
 
 @pytest.mark.parametrize(
@@ -69,7 +83,7 @@ def test_beyond_the_labels_of_a_completely_labeled_frame_a_candidate_is_false() 
 )
 def test_beyond_the_labels_a_candidate_is_unknown_if_the_side_is_open(coverage: Coverage, verdicts: list[int]) -> None:
     labels = frame(label(-1.1, position=-1), label(1.1, position=1), coverage=coverage)
-    assert TruthRule().judge([candidate(-2.5), candidate(2.5)], labels, VIEW).tolist() == verdicts
+    assert judge(curve(-2.5), curve(2.5), labels=labels) == verdicts
     for b, verdict in zip((-2.5, 2.5), verdicts, strict=True):
         tally = BoundaryCounts()
         tally.add(match([found(b)], labels.lanes, labels))
@@ -78,12 +92,11 @@ def test_beyond_the_labels_a_candidate_is_unknown_if_the_side_is_open(coverage: 
 
 def test_beyond_an_absent_ego_boundary_a_candidate_is_false() -> None:
     labels = frame(label(1.1, position=1), coverage=EGO_LANE)
-    assert TruthRule().judge([candidate(-2.5), candidate(2.5)], labels, VIEW).tolist() == [FALSE, UNKNOWN]
+    assert judge(curve(-2.5), curve(2.5), labels=labels) == [FALSE, UNKNOWN]
 
 
 def test_a_short_overlap_is_not_enough_to_be_true() -> None:
-    short = Candidate(curve(-1.1), 600.0, 719.0, 1.0)
-    assert TruthRule().judge([short], frame(label(-1.1)), VIEW).tolist() == [UNSURE]
+    assert judge(curve(-1.1), labels=frame(label(-1.1)), top=600.0) == [UNSURE]
 
 
 def test_a_label_becomes_the_candidate_that_follows_it() -> None:
@@ -91,7 +104,7 @@ def test_a_label_becomes_the_candidate_that_follows_it() -> None:
     rows = np.linspace(700.0, 340.0, 30)
     fitted = fitted_candidate(LabelledLane(np.stack([curved.x(rows), rows], axis=1)), VIEW)
     assert fitted is not None
-    np.testing.assert_allclose(fitted.curve.x(rows), curved.x(rows), atol=0.01)
+    np.testing.assert_allclose(fitted.x(rows), curved.x(rows), atol=0.01)
 
 
 def found(b: float, v: float = 640.0, top: float = 342.0, position: int = -1) -> ReportedBoundary:
@@ -104,7 +117,7 @@ def test_boundaries_are_matched_one_to_one() -> None:
     assert (tally.right, tally.wrong, tally.missed) == (1, 1, 0)  # the second repeats the outermost label
     tally = BoundaryCounts()
     tally.add(match([found(-1.1), found(-3.3)], [label(-1.1)], frame(label(-1.1), label(1.1))))
-    assert (tally.right, tally.wrong, tally.missed) == (1, 0, 0)  # the second lies beyond it: nobody knows
+    assert (tally.right, tally.wrong, tally.missed) == (1, 0, 0)  # the second lies beyond it and is unknown
     tally = BoundaryCounts()
     tally.add(match([found(-1.1), found(-1.1, 645.0)], [label(-1.1)], frame(label(-1.1), coverage=WHOLE)))
     assert (tally.right, tally.wrong, tally.missed) == (1, 1, 0)
@@ -118,7 +131,7 @@ def test_distant_or_short_boundaries_are_wrong_and_the_label_is_missed() -> None
         assert (tally.right, tally.wrong, tally.missed) == (0, 1, 1)
 
 
-def test_errors_are_told_at_640_pixels_of_width() -> None:
+def test_errors_are_in_pixels_of_a_640_pixel_wide_image() -> None:
     tally = BoundaryCounts()
     tally.add(match([found(0.0, 650.0)], [label(0.0)], frame(label(0.0), coverage=WHOLE)))
     assert tally.mean_error == pytest.approx(5.0)

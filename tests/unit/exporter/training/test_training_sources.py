@@ -11,12 +11,15 @@ import cv2
 import numpy as np
 import pytest
 from labelfiles import write_manifest
+from numpy.typing import NDArray
 
-from lanestream.detection import answered
+from lanestream.detection.interface import ModelRole
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
 from lanestream.errors import LabelError, ModelError
+from lanestream.inference.model_info import ClassifierInfo
 from lanestream_exporter.samples.patch_files import PatchCache, read_stores, write_store
 from lanestream_exporter.samples.patches import PatchMaker
+from lanestream_exporter.samples.prior_regressor import load_prior_regressor
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.training.config import TrainingData
 from lanestream_exporter.training.data_sources import PatchFiles, frame_sources, open_datasets, patch_files
@@ -128,15 +131,23 @@ def test_the_first_interrupt_is_a_request_and_the_second_interrupts() -> None:
 def test_with_a_regressor_candidates_are_proposed_as_served(tmp_path: Path) -> None:
     engine = load_engine(provider="cpu")
     still = render_still(sample_scene(np.random.default_rng(8), 640, 360))
-    served, with_prior, alone = (
-        [round(float(candidate.curve.x(300.0)), 1) for candidate in proposed.candidates]
-        for proposed in (
-            answered(engine.open_session().prepare(still.image)),
-            PatchMaker(prior_estimator=engine.pipeline().glance).propose(still.image),
-            PatchMaker().propose(still.image),
-        )
+    searched: list[NDArray[np.uint8]] = []
+
+    def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        if role == "classifier":
+            searched.append(inputs)
+        return engine.models[role].run(inputs)
+
+    engine.open_session().process(still.image, 0.0, infer)
+    info = engine.main_model().info
+    assert isinstance(info, ClassifierInfo)
+    with_prior, alone = (
+        maker.proposed(still.image, still.labels, maker.propose(still.image))[0]
+        for maker in (PatchMaker(info.patch, load_prior_regressor(SHIPPED_REGRESSOR)), PatchMaker(info.patch))
     )
-    assert with_prior == served != alone
+    (served,) = searched
+    np.testing.assert_array_equal(with_prior, served)
+    assert not np.array_equal(alone, served)
     paths = [
         PatchCache(tmp_path, 64, file).labelled("real", lambda: iter([(still.labels, still.image)]), to_train=False)
         for file in (SHIPPED_REGRESSOR, None)
