@@ -1,4 +1,4 @@
-"""Writers of label files of every form, and the pictures that they belong to."""
+"""Writes label files of every format, and the images that they belong to."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from scipy.io import savemat
 
 from lanestream.errors import LabelError
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.checking import Check
+from lanestream_exporter.datasets.checking import DatasetCheck
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.reading import read_dataset, survey
+from lanestream_exporter.datasets.reading import read_dataset, scan_dataset
 from lanestream_exporter.scenes import render_still, sample_clip, sample_scene, write_clip
 
 WIDTH, HEIGHT = 320, 180
@@ -29,53 +29,53 @@ Draw = Callable[[str], None]
 
 @cache
 def road() -> Image:
-    """A rendered picture; not to be changed."""
+    """Returns a rendered image; callers must not change it."""
     return render_still(sample_scene(np.random.default_rng(3), WIDTH, HEIGHT)).image
 
 
 def drawer(folder: Path) -> Draw:
-    """Writes the road to a file below `folder`, each time a picture of its own."""
+    """Returns a function that writes the road to a file below `folder`, a different image each time."""
     written: list[str] = []
 
     def draw(name: str) -> None:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         written.append(name)
-        picture = road().copy()
-        picture[0, len(written)] = 255 - picture[0, len(written)]
-        # Without loss whatever the name says, so that one changed pixel stays one.
-        path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+        image = road().copy()
+        image[0, len(written)] = 255 - image[0, len(written)]
+        # Lossless for every file name, so that exactly one pixel differs.
+        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
     return draw
 
 
 def write_drive(folder: Path) -> None:
-    """A rendered clip of three frames, drive.mp4, and its labels, drive.jsonl."""
+    """Writes a rendered clip of three frames, drive.mp4, and its labels, drive.jsonl."""
     scene = sample_clip(np.random.default_rng(5), WIDTH, HEIGHT, frames=3, fps=25.0)
     write_clip(scene, folder / "drive.mp4", folder / "drive.jsonl")
 
 
-def read(path: Path, form: str = "auto") -> list[LabelledFrame]:
-    """The labelled frames of a data set, whose pictures fit them."""
+def read(path: Path, format_name: str = "auto") -> list[LabelledFrame]:
+    """Returns the labeled frames of a data set, and checks that their images have the right size."""
     frames = []
-    for frame, image in read_dataset(path, form):
+    for frame, image in read_dataset(path, format_name):
         assert image.shape == (frame.height, frame.width, 3)
         assert image.dtype == np.uint8
         frames.append(frame)
     return frames
 
 
-def check_of(path: Path, form: str = "auto") -> Check:
-    """What is said of a data set."""
-    check = Check()
-    for found in survey(path, form):
+def check_dataset(path: Path, format_name: str = "auto") -> DatasetCheck:
+    """Returns the check of a whole data set."""
+    check = DatasetCheck()
+    for found in scan_dataset(path, format_name):
         check.add(found)
     return check
 
 
-def faults(path: Path, form: str = "auto") -> list[str]:
-    """All that is wrong with a data set."""
-    return [str(found) for found in survey(path, form) if isinstance(found, LabelError)]
+def faults(path: Path, format_name: str = "auto") -> list[str]:
+    """Returns everything that is wrong with a data set."""
+    return [str(found) for found in scan_dataset(path, format_name) if isinstance(found, LabelError)]
 
 
 def tusimple_record(name: str, *lanes: list[float]) -> dict[str, Any]:
@@ -100,13 +100,13 @@ def labelme(path: Path, image: str, *shapes: dict[str, Any], **fields: Any) -> N
     path.write_text(json.dumps({**record, "imageHeight": HEIGHT, "imageWidth": WIDTH, **fields}))
 
 
-def strip(points: Any, label: str = "lane", kind: str = "linestrip", **fields: Any) -> dict[str, Any]:
+def line_strip(points: Any, label: str = "lane", kind: str = "linestrip", **fields: Any) -> dict[str, Any]:
     return {"label": label, "points": points, "group_id": None, "shape_type": kind, "flags": {}, **fields}
 
 
 def polyline(points: Points, inside: str = "", **attributes: Any) -> str:
-    told = " ".join(f'{name}="{value}"' for name, value in {"label": "lane", **attributes}.items())
-    return f'<polyline {told} points="{";".join(f"{x},{y}" for x, y in points)}">{inside}</polyline>'
+    attribute_text = " ".join(f'{name}="{value}"' for name, value in {"label": "lane", **attributes}.items())
+    return f'<polyline {attribute_text} points="{";".join(f"{x},{y}" for x, y in points)}">{inside}</polyline>'
 
 
 def cvat_image(name: str, *shapes: str, width: int = WIDTH) -> str:
@@ -130,12 +130,29 @@ def write_ccvl(path: Path, frames: list[tuple[Any, list[tuple[Any, ...]]]]) -> N
     savemat(str(path), {"ld": {"version": 0.0, "source": "image", "frames": records}}, appendmat=False)
 
 
+def write_manifest(path: Path, *datasets: dict[str, Any]) -> Path:
+    """Writes a manifest of data sets; a value that is a table is given as a dict."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"[[dataset]]\n{_toml_lines(dataset)}\n" for dataset in datasets))
+    return path
+
+
+def _toml_lines(table: dict[str, Any]) -> str:
+    return "".join(f"{key} = {_toml_value(value)}\n" for key, value in table.items())
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml_value(item)}" for key, item in value.items()) + " }"
+    return json.dumps(value)
+
+
 def write_mask(path: Path, mask: NDArray[Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), mask)
 
 
-def painted(*lines: tuple[Points, int], thickness: int = 5) -> NDArray[np.uint8]:
+def draw_mask(*lines: tuple[Points, int], thickness: int = 5) -> NDArray[np.uint8]:
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     for line, value in lines:
         cv2.polylines(mask, [np.array(line).round().astype(np.int32)], False, value, thickness)

@@ -1,7 +1,7 @@
-"""`make train-toy`: from labelled frames to an evaluated model that serves, in less than a minute; all under out/toy/.
+"""`make train-toy`: from labeled frames to an evaluated and served model in less than a minute, all under out/toy/.
 
-The frames are rendered and written as somebody's own would be: folders of pictures, one a drive, with LabelMe labels.
-The rest is what docs/training.md says: data check, train, export, evaluate; then a service answers with the model.
+The frames are rendered and written like a user's own: one folder of images per drive, with LabelMe labels and a
+manifest. The rest follows docs/training.md: data check, train, export, evaluate; then a service detects lanes with it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,26 @@ from demo import LANESTREAM, service
 
 from lanestream_exporter.scenes import render_still, sample_scene
 
+MANIFEST = """[[dataset]]
+name = "toy roads"
+path = "learn"
+split = { by = "group", val = 0.2 }
+"""
 DRIVES = {"learn": ("monday", "tuesday", "wednesday"), "test": ("thursday", "friday")}
 FRAMES = 8
 
 
 def main(folder: Path) -> None:
-    """Runs the whole chain in `folder`; raises CalledProcessError where a command fails."""
+    """Runs the whole chain in `folder`. Raises CalledProcessError if a command fails."""
     started = time.monotonic()
     shutil.rmtree(folder, ignore_errors=True)
     for part, drives in DRIVES.items():
         for drive in drives:
             draw_drive(folder / part / drive, seed=sum(drive.encode()))
     config, run, model = folder / "toy.toml", folder / "run", folder / "toy.onnx"
-    config.write_text(recipe() + f'\n[[data.train]]\npath = "{folder / "learn"}"\n', encoding="utf-8")
+    manifest = folder / "datasets.toml"
+    manifest.write_text(MANIFEST, encoding="utf-8")
+    config.write_text(toy_recipe().replace("[data]\n", f'[data]\nmanifest = "{manifest}"\n'), encoding="utf-8")
     lanestream("data", "check", folder / "learn", "--against", folder / "test", "--sheet", folder / "sheet.jpg")
     lanestream("train", "classifier", config, "--run", run)
     lanestream(
@@ -51,13 +58,13 @@ def main(folder: Path) -> None:
     )
     report = folder / "evaluation.json"
     lanestream("evaluate", "--model", model, "--regressor", "none", "--data", folder / "test", "--json", report)
-    answer = served(model, folder / "test" / "thursday" / "0000.jpg", folder / "service.log")
+    answer = detect_lanes(model, folder / "test" / "thursday" / "0000.jpg", folder / "service.log")
     (folder / "answer.json").write_text(json.dumps(answer, indent=2) + "\n", encoding="utf-8")
     print(f"the service found {len(answer['lanes'])} boundaries; {time.monotonic() - started:.0f} s in all")
 
 
 def draw_drive(folder: Path, seed: int) -> None:
-    """Renders pictures into `folder`, each with a LabelMe file beside it."""
+    """Renders images into `folder`, each with a LabelMe file."""
     folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
     for number in range(FRAMES):
@@ -71,26 +78,26 @@ def draw_drive(folder: Path, seed: int) -> None:
         (folder / name).with_suffix(".json").write_text(json.dumps(record), encoding="utf-8")
 
 
-def recipe() -> str:
-    """The shipped configuration of the toy."""
+def toy_recipe() -> str:
+    """Returns the shipped recipe of the toy."""
     command = [LANESTREAM, "train", "recipe", "classifier-toy"]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 def lanestream(*arguments: str | Path) -> None:
-    """Runs a command of the product, its output on the terminal."""
+    """Runs a Lanestream command with its output on the terminal."""
     print("lanestream", *arguments, flush=True)
-    # The project's own frames, where a machine has them, are left out: the toy is the same everywhere.
+    # Without the data folder of this machine, so that paths count from the manifest's folder.
     environment = {name: value for name, value in os.environ.items() if name != "LANESTREAM_DATA"}
     subprocess.run([LANESTREAM, *arguments], check=True, env=environment)
 
 
-def served(model: Path, picture: Path, log_path: Path) -> dict[str, object]:
-    """What a service of its own answers about a picture."""
+def detect_lanes(model: Path, image: Path, log_path: Path) -> dict[str, object]:
+    """Returns the response of a service with `model` to an image."""
     with service(log_path, "--model", model, "--regressor", "none") as url:
-        answer = httpx.post(f"{url}/v1/detect", content=picture.read_bytes(), timeout=30.0).raise_for_status()
-    found: dict[str, object] = answer.json()
-    return found
+        response = httpx.post(f"{url}/v1/detect", content=image.read_bytes(), timeout=30.0).raise_for_status()
+    result: dict[str, object] = response.json()
+    return result
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""AlexNet in PyTorch: torchvision's topology and key names, with batch normalisation beside it while it trains.
+"""AlexNet in PyTorch: torchvision's topology and key names, plus batch normalization while it trains.
 
 Source: A. Krizhevsky, "One weird trick for parallelizing convolutional neural networks", 2014, the variant that
-torchvision ships. The normalisation layers live under their own keys (`norms.*`, `hidden_norms.*`), so a torchvision
-checkpoint loads as it is, and folding them leaves exactly the plain network.
+torchvision ships. The normalization layers have their own keys (`norms.*`, `hidden_norms.*`), so a torchvision
+checkpoint loads unchanged, and folding them leaves exactly the plain network.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lanestream.errors import CheckpointError
 
-# Added to a patch's contrast (1 is full scale), so that the noise of an empty patch is not blown up to a texture.
+# Added to a patch's contrast (1 is full scale), so that the noise of an empty patch is not amplified to a texture.
 LEAST_CONTRAST = 0.03
 
 _CONVOLUTIONS = (0, 3, 6, 8, 10)
@@ -28,10 +28,10 @@ _NORMS = ("norms.", "hidden_norms.")
 
 @dataclass(frozen=True)
 class Shape:
-    """How large an AlexNet is; torchvision's by default.
+    """The size of an AlexNet; by default torchvision's.
 
-    Inputs are `size` x `size` pixels, convolutions have the share `width` of the usual channels, and there are `hidden`
-    units in each hidden layer.
+    Inputs are `size` x `size` pixels, convolutions have the share `width` of torchvision's channels, and each hidden
+    layer has `hidden` units.
     """
 
     size: int = 224
@@ -40,29 +40,29 @@ class Shape:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Channels of the five convolutions."""
+        """The channels of the five convolutions."""
         return tuple(round(self.width * channels) for channels in _CHANNELS)
 
     @property
     def features(self) -> int:
-        """How many numbers the convolutions make of an input."""
+        """The number of outputs of the convolutions."""
         side = (self.size - 7) // 4 + 1
         for _ in range(3):
             side = (side - 3) // 2 + 1
         return self.channels[-1] * side**2
 
 
-# The size of the seed's network, and of torchvision's checkpoints.
+# The size of the published network and of torchvision's checkpoints.
 FULL = Shape()
 
 
 class AlexNet(nn.Module):
-    """The network for `classes` classes; `normalised` adds a batch normalisation after each layer but the last.
+    """The network for `classes` classes; `batch_norm` adds a batch normalization after each layer but the last.
 
-    Without it most hidden units die in the first hundred steps.
+    Without normalization most hidden units die in the first hundred steps.
     """
 
-    def __init__(self, classes: int = 2, shape: Shape = FULL, *, normalised: bool = True, dropout: float = 0.5) -> None:
+    def __init__(self, classes: int = 2, shape: Shape = FULL, *, batch_norm: bool = True, dropout: float = 0.5) -> None:
         super().__init__()
         self.shape = shape
         first, second, third, fourth, last = shape.channels
@@ -82,9 +82,9 @@ class AlexNet(nn.Module):
             nn.MaxPool2d(3, stride=2),
         )
         self.norms = nn.ModuleDict(
-            {str(i): nn.BatchNorm2d(self._convolution(i).out_channels) for i in _CONVOLUTIONS} if normalised else {}
+            {str(i): nn.BatchNorm2d(self._convolution(i).out_channels) for i in _CONVOLUTIONS} if batch_norm else {}
         )
-        self.hidden_norms = nn.ModuleDict({str(i): nn.BatchNorm1d(shape.hidden) for i in _HIDDEN} if normalised else {})
+        self.hidden_norms = nn.ModuleDict({str(i): nn.BatchNorm1d(shape.hidden) for i in _HIDDEN} if batch_norm else {})
         self.classifier = nn.Sequential(
             nn.Dropout(dropout),
             nn.Linear(shape.features, shape.hidden),
@@ -96,7 +96,7 @@ class AlexNet(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Logits (N, classes) of normalised RGB images (N, 3, size, size)."""
+        """Returns logits (N, classes) of normalized RGB images (N, 3, size, size)."""
         for index, layer in enumerate(self.features):
             x = layer(x)
             if str(index) in self.norms:
@@ -110,21 +110,21 @@ class AlexNet(nn.Module):
 
     def _convolution(self, index: int) -> nn.Conv2d:
         layer = self.features[index]
-        assert isinstance(layer, nn.Conv2d)  # noqa: S101 - tells mypy what the constructor above says
+        assert isinstance(layer, nn.Conv2d)  # noqa: S101 - for mypy: the constructor guarantees it
         return layer
 
     def folded(self) -> AlexNet:
-        """The same function as a plain AlexNet: each normalisation goes into the layer before it."""
-        plain = AlexNet(self.classes, self.shape, normalised=False)
+        """Returns the same function as a plain AlexNet: each normalization is folded into the layer before it."""
+        plain = AlexNet(self.classes, self.shape, batch_norm=False)
         plain.load_state_dict({k: v.clone() for k, v in self.state_dict().items() if not k.startswith(_NORMS)})
         for key, norm in self.norms.items():
             assert isinstance(norm, nn.BatchNorm2d)  # noqa: S101 - as above
-            mine = plain._convolution(int(key))
+            convolution = plain._convolution(int(key))
             variance, mean = norm.running_var, norm.running_mean
-            assert variance is not None and mean is not None and mine.bias is not None  # noqa: S101, PT018
+            assert variance is not None and mean is not None and convolution.bias is not None  # noqa: S101, PT018
             gain = norm.weight / torch.sqrt(variance + norm.eps)
-            mine.weight.data = mine.weight.data * gain[:, None, None, None]
-            mine.bias.data = (mine.bias.data - mean) * gain + norm.bias
+            convolution.weight.data = convolution.weight.data * gain[:, None, None, None]
+            convolution.bias.data = (convolution.bias.data - mean) * gain + norm.bias
         for key, norm in self.hidden_norms.items():
             hidden = plain.classifier[int(key)]
             assert isinstance(hidden, nn.Linear) and isinstance(norm, nn.BatchNorm1d)  # noqa: S101, PT018 - as above
@@ -133,51 +133,51 @@ class AlexNet(nn.Module):
 
     @property
     def classes(self) -> int:
-        """How many classes it tells apart."""
+        """The number of classes."""
         last = self.classifier[6]
         assert isinstance(last, nn.Linear)  # noqa: S101 - as above
         return last.out_features
 
 
-def normalise(patches: Tensor) -> Tensor:
-    """RGB patches (N, H, W, 3) uint8, as the network wants them: (N, 3, H, W) float, each about zero.
+def normalize(patches: Tensor) -> Tensor:
+    """Returns RGB patches (N, H, W, 3) uint8 as network inputs (N, 3, H, W) float.
 
-    Each patch is measured against its own brightness and contrast, so that a road in the shadow looks like one in the
-    sun; the channels share both numbers, so that yellow stays yellow. Every fourth row tells them well enough.
+    Each patch is normalized by its own brightness and contrast, so that a road in the shade looks like one in the sun.
+    The channels share both numbers, so that yellow stays yellow. Every fourth row is enough to estimate them.
     """
     images = patches.permute(0, 3, 1, 2).float() / 255.0
-    told = images[:, :, ::4]
-    mean = told.mean(dim=(1, 2, 3), keepdim=True)
-    deviation = torch.sqrt(((told - mean) ** 2).mean(dim=(1, 2, 3), keepdim=True))
+    rows = images[:, :, ::4]
+    mean = rows.mean(dim=(1, 2, 3), keepdim=True)
+    deviation = torch.sqrt(((rows - mean) ** 2).mean(dim=(1, 2, 3), keepdim=True))
     return (images - mean) / (deviation + LEAST_CONTRAST)
 
 
-def initialise(network: AlexNet, weights: Path) -> None:
-    """Takes over the convolutions and hidden layers of a torchvision AlexNet checkpoint; the last layer stays new.
+def load_torchvision_weights(network: AlexNet, weights: Path) -> None:
+    """Loads the convolutions and hidden layers of a torchvision AlexNet checkpoint; the last layer stays random.
 
-    Raises CheckpointError where the file is not one, or the network is not as large as those are.
+    Raises CheckpointError if the file is not such a checkpoint, or if the network has another size.
     """
     state = load_state(weights)
     if network.shape != FULL:
         full = "set " + ", ".join(f"{key} = {value}" for key, value in asdict(FULL).items())
         raise CheckpointError(
-            f"{weights} is no checkpoint of a run, and the network is smaller than torchvision's", full
+            f"{weights} is not a checkpoint of a run, and the network is smaller than torchvision's", full
         )
     wanted = {k: v for k, v in network.state_dict().items() if not k.startswith((*_NORMS, "classifier.6."))}
     wrong = [key for key, value in wanted.items() if key not in state or state[key].shape != value.shape]
     if wrong:
-        raise CheckpointError(f"{weights} lacks {wrong[0]} of a torchvision AlexNet", "give alexnet weights")
+        raise CheckpointError(f"{weights} lacks {wrong[0]} of a torchvision AlexNet", "give its weights")
     network.load_state_dict({key: state[key] for key in wanted}, strict=False)
 
 
 def load_state(path: Path) -> dict[str, Any]:
-    """The dictionary in a PyTorch file, no code of it run. Raises CheckpointError with one line."""
+    """Returns the dictionary in a PyTorch file without running code from it. Raises CheckpointError with one line."""
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}", "give the path of a .pt file")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises half a dozen types, with pages of advice, for what is no checkpoint
-        raise CheckpointError(f"{path} is not a PyTorch checkpoint", "give a file that holds weights alone") from error
+    except Exception as error:  # torch.load raises many types, with pages of advice, for other files
+        raise CheckpointError(f"{path} is not a PyTorch checkpoint", "give a file that holds only weights") from error
     if not isinstance(state, dict):
         raise CheckpointError(f"{path} holds a {type(state).__name__}", "give a file that holds a state_dict")
     return state

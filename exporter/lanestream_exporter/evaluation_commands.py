@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -12,23 +12,22 @@ import click
 from rich.console import Console
 
 from lanestream.engine import SHIPPED_MODEL, load_engine, resolve_regressor
-from lanestream.errors import LabelError, ModelError, SourceError, needs_extra
-from lanestream_exporter.datasets.folder import DataFolder
-from lanestream_exporter.datasets.formats import FORMATS
-from lanestream_exporter.datasets.reading import form_of, read_dataset
-from lanestream_exporter.datasets.splits import data_root
+from lanestream.errors import ModelError, SourceError, needs_extra
+from lanestream_exporter.datasets.files import DataFolder
+from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
+from lanestream_exporter.datasets.manifest import DatasetCollection
+from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
-from lanestream_exporter.evaluation.measuring import Material
-from lanestream_exporter.evaluation.measuring import evaluate as measure
+from lanestream_exporter.evaluation.measuring import EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
-from lanestream_exporter.evaluation.score import score as measured
+from lanestream_exporter.evaluation.score import score as score_results
 from lanestream_exporter.evaluation.tables import tables
 
 if TYPE_CHECKING:
     from lanestream_exporter.datasets.splits import Split
 
-_REGRESSOR: Final = "Regressor that shows classifiers where to look, or `none`.  [default: the shipped one]"
-_NARROWEST: Final = 100  # columns of the tables, also where the terminal has fewer
+_REGRESSOR: Final = "Regressor whose ego-lane prior the classifiers use, or `none`.  [default: the shipped one]"
+_MIN_WIDTH: Final = 100  # columns of the tables, even if the terminal has fewer
 
 
 @click.command()
@@ -38,7 +37,7 @@ _NARROWEST: Final = 100  # columns of the tables, also where the terminal has fe
     type=click.Path(path_type=Path),
     multiple=True,
     default=[SHIPPED_MODEL],
-    help="ONNX file; give it again for another one.  [default: the shipped classifier]",
+    help="ONNX file; may be repeated.  [default: the shipped classifier]",
 )
 @click.option("--regressor", type=click.Path(path_type=Path), help=_REGRESSOR)
 @click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
@@ -47,10 +46,14 @@ _NARROWEST: Final = 100  # columns of the tables, also where the terminal has fe
 @click.option(
     "--data",
     type=click.Path(path_type=Path),
-    help="Labelled frames of your own, or the folder of real frames that --split is of.  [default: $LANESTREAM_DATA]",
+    help="Labeled frames, or the folder that the paths of the manifest count from.  [default: $LANESTREAM_DATA]",
 )
 @click.option(
-    "--format", "form", type=click.Choice(["auto", *FORMATS]), default="auto", help="The form of your labels."
+    "--manifest", type=click.Path(path_type=Path), help="Manifest of the data sets that --split is of."
+    "  [default: the shipped one]",
+)  # fmt: skip
+@click.option(
+    "--format", "format_name", type=click.Choice([AUTO, *FORMATS]), default=AUTO, help="The format of your labels."
 )
 def evaluate(
     models: Sequence[Path],
@@ -59,19 +62,20 @@ def evaluate(
     out: Path | None,
     json_path: Path | None,
     data: Path | None,
-    form: str,
+    manifest: Path | None,
+    format_name: str,
 ) -> None:
-    """Measure model files and two classical baselines on labelled frames.
+    """Evaluate model files and two classical baselines on labeled frames.
 
-    Candidates (level A), boundaries of single images and of clips (B), and the field's metrics (C); docs/evaluation.md
-    describes every figure. Your own frames are measured as single images, all of them.
+    Figures are for candidates (level A), boundaries of single images and of clips (B), and the field's metrics (C);
+    docs/evaluation.md describes each. A folder of labeled frames given with --data is evaluated as single images.
     """
-    material = _material(data, form, split)
-    evaluation = measure(
-        _methods(models, regressor), material, lambda stage: click.echo(f"measuring {stage} ...", err=True)
+    evaluation_set = _evaluation_set(data, manifest, format_name, split)
+    evaluation = run_evaluation(
+        _methods(models, regressor), evaluation_set, lambda stage: click.echo(f"measuring {stage} ...", err=True)
     )
     figures = evaluation.figures()
-    console = Console(width=max(_NARROWEST, Console().width))
+    console = Console(width=max(_MIN_WIDTH, Console().width))
     for table in tables(figures):
         console.print(table)
     if out is not None:
@@ -89,19 +93,17 @@ def evaluate(
 @click.argument("results", type=click.Path(path_type=Path))
 @click.argument("labels", type=click.Path(path_type=Path))
 def score(results: Path, labels: Path) -> None:
-    """Measure RESULTS, a file that `stream --jsonl` wrote, against the LABELS of the clip."""
-    click.echo(json.dumps(measured(results, labels), indent=2))
+    """Evaluate RESULTS, a file that `stream --jsonl` wrote, against the LABELS of the clip."""
+    click.echo(json.dumps(score_results(results, labels), indent=2))
 
 
-def _material(data: Path | None, form: str, split: Split) -> Material:
-    """The project's split where `data` is its folder of real frames, else all that is labelled in `data`."""
-    if data is None:
-        return Material.of_split(data_root(), split)
-    if form == "auto":
-        with suppress(LabelError):
-            return Material.of_split(data_root(data), split)
-    told = form_of(DataFolder.at(data), form)
-    return Material(data.name, lambda: read_dataset(data, told))
+def _evaluation_set(data: Path | None, manifest: Path | None, format_name: str, split: Split) -> EvaluationSet:
+    """Returns a split of the manifest, or all labeled frames in `data` if it has none of the shipped data sets."""
+    datasets = DatasetCollection.open(manifest, data)
+    if data is None or manifest is not None or (format_name == AUTO and datasets.any_present):
+        return EvaluationSet.of_split(datasets, split)
+    name = format_of(DataFolder.at(data), format_name)
+    return EvaluationSet(data.name, lambda: read_dataset(data, name))
 
 
 @contextmanager
@@ -113,11 +115,11 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _methods(models: Sequence[Path], regressor: Path | None) -> list[Method]:
-    guide = resolve_regressor(regressor)
-    ours = [ServedModel(load_engine(path, "cpu", guide)) for path in models]
+    regressor_file = resolve_regressor(regressor)
+    ours = [ServedModel(load_engine(path, "cpu", regressor_file)) for path in models]
     methods: list[Method] = [*ours, Baseline(HoughLinesBaseline()), Baseline(SlidingWindowBaseline())]
     names = [method.name for method in methods]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise ModelError(f"two of the models are named {twice!r}", "give models of different names or versions")
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise ModelError(f"two of the models are named {repeated!r}", "give models of different names or versions")
     return methods

@@ -11,11 +11,11 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from lanestream.detection.patches import PatchGeometry
 from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
+from lanestream.road.crops import PatchGeometry
 from lanestream_exporter.alexnet import FULL
-from lanestream_exporter.datasets.splits import data_root
+from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
@@ -23,10 +23,9 @@ from lanestream_exporter.exporting.exportable import ExportableNetwork, Precisio
 from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import NORMALIZATIONS
 from lanestream_exporter.exporting.proof import ModelMeasurement
-from lanestream_exporter.samples.prior_regressor import prior_estimator
-from lanestream_exporter.training.config import PatchData
+from lanestream_exporter.samples.prior_regressor import load_prior_regressor
 
-_PATCH_KEYS = {"size": int, "half_width": float, "min_half_width": float, "lean": float}
+_PATCH_KEYS = {"size": int, "half_width": float, "min_half_width": float, "obliquity": float}
 
 
 def _classes(_context: click.Context, _option: click.Parameter, value: str | None) -> tuple[str, ...] | None:
@@ -46,7 +45,7 @@ def _patch_geometry(_context: click.Context, _option: click.Parameter, value: st
             given[key] = _PATCH_KEYS[key](number)
         except ValueError:
             raise click.BadParameter(f"{key} must be a number, not {number!r}") from None
-        if not (0 < given[key] < math.inf or (key == "lean" and given[key] == 0)):
+        if not (0 < given[key] < math.inf or (key == "obliquity" and given[key] == 0)):
             raise click.BadParameter(f"{key} must be above 0")
     return PatchGeometry(**given)
 
@@ -97,9 +96,7 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
     # An invalid checkpoint must fail now, not after the frames have been prepared.
     network, training = read_network(checkpoint, foreign)
     network = _with_prior(network, given["regressor"])
-    own = _own_frames(training)
-    root = data_root(given["data"]) if given["data"] and own is None else None
-    frames = ExportFrames(root, rendered=given["scenes"], own=own)
+    frames = ExportFrames(_datasets(training, given["data"]), rendered=given["scenes"])
     energy = network.default_rank_energy if given["rank_energy"] is None else given["rank_energy"]
     settings = ExportSettings(given["name"] or network.default_name, energy, given["precision"], given["tolerance"])
     _print_report(out, export_network(network, out, settings, Provenance(training, frames), click.echo), frames)
@@ -109,19 +106,21 @@ def _with_prior(network: ExportableNetwork, regressor: Path | None) -> Exportabl
     """Returns a classifier with the prior of `regressor`, as it is served; returns a regressor unchanged."""
     if isinstance(network, ExportableClassifier):
         path = resolve_regressor(regressor)
-        return network if path is None else replace(network, prior_estimator=prior_estimator(path))
+        return network if path is None else replace(network, prior=load_prior_regressor(path))
     if regressor is not None:
         raise click.UsageError("--regressor is only for classifiers; CHECKPOINT is a regressor")
     return network
 
 
-def _own_frames(training: dict[str, Any]) -> PatchData | None:
-    """Returns the user's own frames that the network was trained on; None if there were none or they are missing."""
-    data = training.get("config", {}).get("data", {})
-    paths = [frames["path"] for key in ("train", "validation") for frames in data.get(key, [])]
-    if not paths or not all(Path(path).exists() for path in paths):
-        return None
-    return PatchData.model_validate({key: data[key] for key in ("train", "validation", "validation_share")})
+def _datasets(training: dict[str, Any], data: Path | None) -> DatasetCollection | None:
+    """Returns the data sets of the manifest that a network was trained with; None if its frames are not available.
+
+    The shipped manifest is only used with a data folder, `data`.
+    """
+    manifest = training.get("config", {}).get("data", {}).get("manifest")
+    if manifest is not None and Path(manifest).is_file():
+        return DatasetCollection.open(Path(manifest), data)
+    return None if data is None else DatasetCollection.open(None, data)
 
 
 def _foreign_network(

@@ -11,115 +11,123 @@ from types import FrameType
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from lanestream_exporter.samples.patch_files import PatchStores
+from lanestream_exporter.datasets.manifest import origin_of
+from lanestream_exporter.samples.patch_files import PatchCache
+from lanestream_exporter.toml_files import CONFIG_FOLDER
 from lanestream_exporter.training.classifier import ClassifierTask, starting_network
-from lanestream_exporter.training.config import SHIPPED, ClassifierConfig, TrainConfig, read_config
-from lanestream_exporter.training.device import best_device, described
-from lanestream_exporter.training.framesources import frame_sources
-from lanestream_exporter.training.loop import Progress as Learnt
-from lanestream_exporter.training.loop import Run, Task
-from lanestream_exporter.training.regressor import RegressorConfig, RegressorTask, starting_regressor
-from lanestream_exporter.training.sources import origin_of, patch_files
+from lanestream_exporter.training.config import ClassifierConfig, RegressorConfig, TrainConfig, read_config
+from lanestream_exporter.training.data_sources import frame_sources, open_datasets, patch_files
+from lanestream_exporter.training.loop import Run, Task, TrainingProgress, best_device, describe_device
+from lanestream_exporter.training.regressor import RegressorTask, starting_regressor
 
 _INTERRUPTED = 130
 
 _RUN = click.option(
-    "--run", "folder", type=click.Path(path_type=Path), required=True, help="Folder of the run; made where missing."
+    "--run", "folder", type=click.Path(path_type=Path), required=True, help="Folder of the run; created if missing."
 )
 _DATA = click.option(
-    "--data", type=click.Path(path_type=Path), help="Folder of real frames [default: $LANESTREAM_DATA]."
+    "--data",
+    type=click.Path(path_type=Path),
+    help="Folder that the paths of the data set manifest count from."
+    "  [default: $LANESTREAM_DATA, else the manifest's folder]",
 )
 
 
 @click.group()
 def train() -> None:
-    """Train a network. The same command again goes on where the run was."""
+    """Train a network. Run the same command again to resume."""
 
 
 @train.command()
 @click.argument("config", type=click.Path(path_type=Path), default=Path("classifier"))
 @_RUN
 @_DATA
-@click.option("--patches", type=click.Path(path_type=Path), help="Folder that keeps the patches [default: in the run].")
+@click.option("--patches", type=click.Path(path_type=Path), help="Folder for the patches.  [default: in the run]")
 def classifier(config: Path, folder: Path, data: Path | None, patches: Path | None) -> None:
-    """Train the candidate classifier as CONFIG says: a TOML file, or the name of a shipped one.
+    """Train the candidate classifier by the recipe CONFIG: a TOML file, or the name of a shipped one.
 
-    Renders scenes, cuts patches of them and of real frames, and mixes the two.
+    Renders scenes, cuts patches from them and from real frames, and mixes the two.
     """
     settings = read_config(config, ClassifierConfig)
-    network = starting_network(settings)  # what is no checkpoint is told now, not after the patches have been made
-    guide = settings.data.guide
+    network = starting_network(settings)  # before the patches, so that a bad checkpoint is reported early
+    datasets = open_datasets(settings.data, data)
+    regressor_file = settings.data.regressor
+    cache = PatchCache(
+        patches or folder / "patches", settings.network.size, Path(regressor_file) if regressor_file else None
+    )
     with _bar("rendering") as advance:
-        stores = PatchStores(patches or folder / "patches", settings.network.size, Path(guide) if guide else None)
-        files = patch_files(settings.data, stores, data, advance)
+        files = patch_files(settings.data, datasets, cache, advance)
     sources = [part.read() for part in files]
     for source in sources:
         click.echo(f"{source.name}: {len(source.train)} patches to train on, {len(source.check)} to validate with")
-    _learn(ClassifierTask(settings, network, sources, origin_of(settings.data)), settings, folder)
+    origin = origin_of(datasets, settings.data.rendered_scenes)
+    _train(ClassifierTask(settings, network, sources, origin), settings, folder)
 
 
 @train.command()
 @click.argument("config", type=click.Path(path_type=Path), default=Path("regressor"))
 @_RUN
 @_DATA
-@click.option("--frames", type=click.Path(path_type=Path), help="Folder that keeps the scenes [default: in the run].")
+@click.option("--frames", type=click.Path(path_type=Path), help="Folder for the scenes.  [default: in the run]")
 def regressor(config: Path, folder: Path, data: Path | None, frames: Path | None) -> None:
-    """Train the regressor as CONFIG says: a TOML file, or the name of a shipped one.
+    """Train the regressor by the recipe CONFIG: a TOML file, or the name of a shipped one.
 
-    Renders scenes, and moves them and the real frames as other cameras and roads would show them.
+    Renders scenes, and warps them and real frames as other cameras and roads would show them.
     """
     settings = read_config(config, RegressorConfig)
     network = starting_regressor(settings)
+    datasets = open_datasets(settings.data, data)
     with _bar("rendering") as advance:
-        sources = frame_sources(settings.data, frames or folder / "frames", data, advance)
+        sources = frame_sources(settings.data, datasets, frames or folder / "frames", advance)
     for source in sources:
         click.echo(f"{source.name}: {len(source.train)} frames to train on, {len(source.check)} to validate with")
-    _learn(RegressorTask(settings, network, sources, origin_of(settings.data)), settings, folder)
+    origin = origin_of(datasets, settings.data.rendered_scenes)
+    _train(RegressorTask(settings, network, sources, origin), settings, folder)
 
 
 @train.command()
-@click.argument("name", type=click.Choice(sorted(path.stem for path in SHIPPED.glob("*.toml"))))
+@click.argument("name", type=click.Choice(sorted(path.stem for path in CONFIG_FOLDER.glob("*.toml"))))
 def recipe(name: str) -> None:
-    """Print the shipped configuration NAME, to start one's own from."""
-    click.echo((SHIPPED / f"{name}.toml").read_text(encoding="utf-8"), nl=False)
+    """Print the shipped recipe NAME, or the manifest `datasets`, as a starting point for your own."""
+    click.echo((CONFIG_FOLDER / f"{name}.toml").read_text(encoding="utf-8"), nl=False)
 
 
-def _learn(task: Task, config: TrainConfig, folder: Path) -> None:
-    """Trains to the end or to an interruption, and tells how it goes."""
+def _train(task: Task, config: TrainConfig, folder: Path) -> None:
+    """Trains to the end or until interrupted, and shows the progress."""
     run = Run(task, config, folder)
-    click.echo(f"training on {described(best_device())}" + (f" from step {run.step} on" if run.step else ""))
+    click.echo(f"training on {describe_device(best_device())}" + (f" from step {run.step} on" if run.step else ""))
     with interruptible() as stopped, _progress() as bar:
         shown = bar.add_task("training", total=config.steps, completed=run.step)
 
-        def told(learnt: Learnt) -> None:
-            bar.update(shown, completed=learnt.step, description=f"training, loss {learnt.loss:.3f}")
-            if learnt.figures:
-                figures = ", ".join(f"{name.replace('_', ' ')} {value:.4f}" for name, value in learnt.figures.items())
+        def report(progress: TrainingProgress) -> None:
+            bar.update(shown, completed=progress.step, description=f"training, loss {progress.loss:.3f}")
+            if progress.figures:
+                figures = ", ".join(f"{name.replace('_', ' ')} {value:.4f}" for name, value in progress.figures.items())
                 bar.console.print(
-                    f"step {learnt.step}: loss {learnt.loss:.3f}, {figures}", highlight=False, soft_wrap=True
+                    f"step {progress.step}: loss {progress.loss:.3f}, {figures}", highlight=False, soft_wrap=True
                 )
 
-        run.go(told, stopped)
+        run.train(report, stopped)
     if not run.finished:
-        click.echo(f"stopped after step {run.step}; the same command again goes on from there")
+        click.echo(f"stopped after step {run.step}; run the same command again to resume")
         raise click.exceptions.Exit(_INTERRUPTED)
     click.echo(f"best checkpoint: {run.best}")
 
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C in the block makes the yielded function true, so that a step is never cut in two; a second one ends it."""
-    asked = False
+    """Yields a function that returns true after Ctrl-C, so that a step can be finished; a second Ctrl-C interrupts."""
+    requested = False
 
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
+    def request(_number: int, _frame: FrameType | None) -> None:
+        nonlocal requested
+        if requested:
             raise KeyboardInterrupt
-        asked = True
+        requested = True
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: asked
+        yield lambda: requested
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -127,7 +135,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def _bar(name: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar that is told (how many more are done, how many there are)."""
+    """Shows a progress bar; the yielded function takes the number of items just done and the number of all."""
     with _progress() as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, total: bar.update(task, advance=done, total=total)

@@ -1,4 +1,4 @@
-"""Real frames: where they are, or why the tests that need them are skipped."""
+"""The folder of real frames; tests that need them are skipped without it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-_BESIDE = Path(__file__).parents[3] / "shared" / "data"
+_DEFAULT = Path(__file__).parents[3] / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """Labelled real frames; a folder that LANESTREAM_DATA names has to hold them."""
+    """Returns the folder of labeled real frames; if LANESTREAM_DATA is set, they must be there."""
     named = os.environ.get("LANESTREAM_DATA")
-    if not named and not _BESIDE.is_dir():
-        pytest.skip("no labelled real frames: LANESTREAM_DATA is not set")
-    return Path(named) if named else _BESIDE
+    if not named and not _DEFAULT.is_dir():
+        pytest.skip("no labeled real frames: LANESTREAM_DATA is not set")
+    return Path(named) if named else _DEFAULT

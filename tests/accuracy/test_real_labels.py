@@ -1,18 +1,18 @@
-"""The labels of the real frames that figures are measured on: all of them are read, and nothing is wrong with them."""
+"""The labels of the real frames that figures are measured on are all read and have no faults."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from labelfiles import check_of
+from labelfiles import check_dataset
 
 
 def test_the_real_labels_are_sound(data: Path) -> None:
-    tusimple = check_of(data / "tusimple")
+    tusimple = check_dataset(data / "tusimple")
     assert tusimple.faults == []
     assert tusimple.contents.groups == {"tusimple 0313-1": 171}
     assert tusimple.contents.lanes == {3: 26, 4: 145}
-    clip = check_of(data / "udacity" / "labels" / "highway_concrete.jsonl")
+    clip = check_dataset(data / "udacity" / "labels" / "highway_concrete.jsonl")
     assert clip.faults == []
     assert clip.contents.groups == {"highway_concrete": 12}
     assert clip.contents.sizes == {(1280, 720): 12}

@@ -1,4 +1,4 @@
-"""Data sets to read: a folder to draw into, and a rendered drive with its labels."""
+"""Fixtures with data sets: a folder to draw images into, and a rendered drive with its labels."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def create_app(limit: int) -> FastAPI:
     """Returns the service, which classifies at most `limit` candidates per frame."""
     app = FastAPI()
     torch.manual_seed(0)
-    network = AlexNet(normalised=False).eval()
+    network = AlexNet(batch_norm=False).eval()
     lane_probabilities(network, np.zeros((limit, FULL.size, FULL.size, 3), np.uint8))
 
     @app.get("/readyz")

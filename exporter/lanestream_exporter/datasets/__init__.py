@@ -1,1 +1,1 @@
-"""Readers of labelled frames, each yielding the one in-memory form of `labels`."""
+"""Labeled frames: readers of every label format, the data set manifest, splits, checks and label propagation."""

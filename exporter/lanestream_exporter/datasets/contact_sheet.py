@@ -1,4 +1,4 @@
-"""A contact sheet: small pictures of labelled frames with their lanes drawn on, to look through at a glance."""
+"""Draws a contact sheet: thumbnails of labeled frames with their lanes."""
 
 from __future__ import annotations
 
@@ -14,32 +14,31 @@ from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabelledFrame
 
 _COLUMNS: Final = 6
-_WIDTH: Final = 320  # pixels of a small picture
+_WIDTH: Final = 320  # pixels of a thumbnail
 _CAPTION: Final = 18  # pixels of height
-_MOST: Final = 60
+_MOST: Final = 60  # thumbnails
 _SUBPIXEL_BITS: Final = 4
-_KINDS: Final = (".jpg", ".jpeg", ".png")
+_SUFFIXES: Final = (".jpg", ".jpeg", ".png")
 
-Colour = tuple[int, int, int]  # blue, green, red
-
-_POSITIONS: Final[Mapping[int, Colour]] = {
+# Colors are blue, green, red.
+_POSITIONS: Final[Mapping[int, tuple[int, int, int]]] = {
     -2: (200, 120, 220),
     -1: (40, 170, 255),
     1: (255, 190, 70),
     2: (110, 230, 240),
 }
-# Where nobody told positions, neighbours are told apart.
-_IN_TURN: Final[tuple[Colour, ...]] = ((60, 220, 60), (60, 60, 255), (255, 200, 40), (240, 60, 240), (60, 220, 255))
+# Colors of lanes without a position, in order.
+_PALETTE: Final = ((60, 220, 60), (60, 60, 255), (255, 200, 40), (240, 60, 240), (60, 220, 255))
 
 
 class ContactSheet:
-    """Keeps up to 60 of the frames that are added, evenly spread over all of them."""
+    """Keeps up to 60 of the added frames, evenly spread over all of them."""
 
     def __init__(self, path: Path) -> None:
-        """Will be written to `path`. Raises SourceError where its suffix is of no kind of picture."""
-        if path.suffix.lower() not in _KINDS:
+        """Starts a sheet to be written to `path`. Raises SourceError if its suffix is not that of an image."""
+        if path.suffix.lower() not in _SUFFIXES:
             raise SourceError(
-                f"can't write a picture to {path}", f"a path that ends in {' or '.join(_KINDS)} is accepted"
+                f"can't write an image to {path}", f"a path that ends in {' or '.join(_SUFFIXES)} is accepted"
             )
         self._path = path
         self._tiles: list[Image] = []
@@ -50,7 +49,7 @@ class ContactSheet:
         return len(self._chosen())
 
     def add(self, frame: LabelledFrame, image: Image) -> None:
-        """Takes a frame, or passes it over."""
+        """Adds a frame, or skips it to keep the sheet evenly spread."""
         if self._seen % self._stride == 0:
             self._tiles.append(_tile(frame, image))
         self._seen += 1
@@ -59,7 +58,7 @@ class ContactSheet:
             self._stride *= 2
 
     def write(self) -> None:
-        """Writes the sheet. Raises SourceError where that can't be done."""
+        """Writes the sheet. Raises SourceError if it can't be written."""
         data = cv2.imencode(self._path.suffix.lower(), self._page())[1].tobytes()
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,14 +82,14 @@ class ContactSheet:
 
 
 def _tile(frame: LabelledFrame, image: Image) -> Image:
-    """A frame at its small size with its lanes, and its name below."""
+    """Returns the thumbnail of a frame with its lanes, and its name underneath."""
     scale = _WIDTH / frame.width
-    picture = cv2.resize(image, (_WIDTH, max(1, round(frame.height * scale))), interpolation=cv2.INTER_AREA)
+    thumbnail = cv2.resize(image, (_WIDTH, max(1, round(frame.height * scale))), interpolation=cv2.INTER_AREA)
     for number, lane in enumerate(frame.lanes):
-        colour = _POSITIONS.get(lane.position or 0, _IN_TURN[number % len(_IN_TURN)])
+        color = _POSITIONS.get(lane.position or 0, _PALETTE[number % len(_PALETTE)])
         fixed = np.round(((lane.points + 0.5) * scale - 0.5) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        cv2.polylines(picture, [fixed], False, colour, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
+        cv2.polylines(thumbnail, [fixed], False, color, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
     caption = np.zeros((_CAPTION, _WIDTH, 3), np.uint8)
     name = frame.source.encode("ascii", "replace").decode()[-52:]
     cv2.putText(caption, name, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (220, 220, 220), 1, cv2.LINE_AA)
-    return np.vstack([picture, caption]).astype(np.uint8, copy=False)
+    return np.vstack([thumbnail, caption]).astype(np.uint8, copy=False)

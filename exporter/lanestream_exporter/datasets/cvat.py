@@ -1,7 +1,7 @@
-"""CVAT's labels, "CVAT for images 1.1" and "CVAT for video 1.1": of what an XML file holds, polylines are boundaries.
+"""Reads CVAT's labels, "CVAT for images 1.1" and "CVAT for video 1.1". Polylines in the XML file are lane boundaries.
 
-Attributes `type` (or `kind`), `color` (or `colour`), `position` and `id` of a polyline tell what they say; the words
-of its label stand in for the first two. A track's id is the boundary's id. Coordinates are taken as written.
+The attributes `type` (or `kind`), `color` (or `colour`), `position` and `id` of a polyline are used; words of its
+label stand in for the first two. A track's id is the boundary's id. Coordinates are taken as written.
 Format: docs.cvat.ai/docs/dataset_management/formats/format-cvat and docs.cvat.ai/docs/other/xml_format.
 """
 
@@ -17,22 +17,25 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import parse
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import Entries, Entry, colour_in, kind_in, numbered, size_of
-from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
-from lanestream_exporter.datasets.labels import LabelledLane
-from lanestream_exporter.datasets.pictures import Picture
-from lanestream_exporter.datasets.polylines import points_of
-from lanestream_exporter.datasets.records import placed, unusable
+from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, color_in, kind_in, numbered, size_of
+from lanestream_exporter.datasets.files import DataFolder, drive_of, error_at, field_error, path_in_labels
+from lanestream_exporter.datasets.images import ImageLocation
+from lanestream_exporter.datasets.labels import LabelledLane, points_of
 
 _SHAPES: Final = frozenset({"box", "polygon", "points", "cuboid", "skeleton", "ellipse", "mask"})
 _POSITION: Final = re.compile(r"[+-]?[1-9]")
 _ACCEPTED: Final = "an XML file of CVAT, for images or for video, is accepted"
 
 
-def cvat_entries(folder: DataFolder) -> Entries:
-    """The frames of all XML files.
+def is_cvat(path: Path, start: bytes) -> bool:
+    """Whether the file at `path` holds CVAT labels, by its first bytes."""
+    return path.suffix.lower() == ".xml" and b"<annotations" in start
 
-    A group is the folder of the images where an image's name has one, else the name of the task; or the video.
+
+def cvat_entries(folder: DataFolder) -> LabelEntries:
+    """Yields the frames of all XML files.
+
+    A group is the folder of the images if their names have one, else the name of the task; of a video task, the video.
     """
     for path in folder.with_suffix(".xml"):
         try:
@@ -45,9 +48,9 @@ def cvat_entries(folder: DataFolder) -> Entries:
             try:
                 yield _image_entry(image, place, _Export(path, root, folder))
             except (ValueError, KeyError, TypeError, OverflowError) as error:
-                yield unusable(place, error, "name, width and height, and a polyline points")
+                yield field_error(place, error, "name, width and height, and a polyline points")
             except LabelError as error:
-                yield placed(place, error)
+                yield error_at(place, error)
         yield from _track_entries(_Export(path, root, folder))
 
 
@@ -59,9 +62,9 @@ class _Export:
     root: Element
     folder: DataFolder
 
-    def text(self, *places: str) -> str:
-        """What the first of the elements at `places` that is there says."""
-        found = (self.root.findtext(place) for place in places)
+    def text(self, *paths: str) -> str:
+        """Returns the text of the first of the elements at `paths` that has any."""
+        found = (self.root.findtext(path) for path in paths)
         return next((text.strip() for text in found if text), "")
 
 
@@ -73,15 +76,15 @@ def _root(path: Path) -> Element:
     except ParseError as error:
         raise LabelError(f"{path}:{error.position[0]}: not XML: {error}", _ACCEPTED) from None
     except (DefusedXmlException, ValueError):
-        raise LabelError(f"{path} declares entities or a document type", f"{_ACCEPTED}; it has none") from None
+        raise LabelError(f"{path} declares entities or a document type", f"{_ACCEPTED}, without those") from None
     if root is None or root.tag != "annotations":
-        raise LabelError(f"{path} is XML, but not of CVAT: its root is no <annotations>", _ACCEPTED)
+        raise LabelError(f"{path} is XML, but not of CVAT: its root element is not <annotations>", _ACCEPTED)
     return root
 
 
-def _image_entry(image: Element, place: str, export: _Export) -> Entry:
-    name, base = relative(image.attrib["name"]), export.path.parent
-    subset = relative(image.get("subset") or ".")
+def _image_entry(image: Element, place: str, export: _Export) -> LabelEntry:
+    name, base = path_in_labels(image.attrib["name"]), export.path.parent
+    subset = path_in_labels(image.get("subset") or ".")
     found = export.folder.find(base / "images" / name, base / name, base / "images" / subset / name)
     lanes: list[LabelledLane] = []
     others: list[str] = []
@@ -95,7 +98,9 @@ def _image_entry(image: Element, place: str, export: _Export) -> Entry:
     group = drive_of(found.parent) if len(name.parts) > 1 or not task else f"task {task}"
     size = size_of(image.attrib["width"], image.attrib["height"])
     source = export.folder.name(found)
-    return Entry(place, source, group, Picture(found), numbered(lanes, "polyline"), size, others=tuple(others))
+    return LabelEntry(
+        place, source, group, ImageLocation(found), numbered(lanes, "polyline"), size, others=tuple(others)
+    )
 
 
 def _lane(shape: Element, where: str, label: str, lane_id: int | None) -> LabelledLane:
@@ -103,18 +108,18 @@ def _lane(shape: Element, where: str, label: str, lane_id: int | None) -> Labell
         points = points_of([[float(n) for n in pair.split(",")] for pair in shape.attrib["points"].split(";") if pair])
     except ValueError:
         raise ValueError(f"{where}: its points are not pairs of numbers") from None
-    told = {str(a.get("name")).lower(): (a.text or "").strip().lower() for a in shape.iterfind("attribute")}
+    attributes = {str(a.get("name")).lower(): (a.text or "").strip().lower() for a in shape.iterfind("attribute")}
     words = re.findall(r"[a-z]+", label.lower())
-    kind = kind_in([told.get("type", ""), told.get("kind", ""), *words])
-    colour = colour_in([told.get("color", ""), told.get("colour", ""), *words])
-    position = told.get("position", "")
-    if lane_id is None and told.get("id", "").isdecimal():
-        lane_id = int(told["id"])
-    return LabelledLane(points, lane_id, int(position) if _POSITION.fullmatch(position) else None, kind, colour)
+    kind = kind_in([attributes.get("type", ""), attributes.get("kind", ""), *words])
+    color = color_in([attributes.get("color", ""), attributes.get("colour", ""), *words])
+    position = attributes.get("position", "")
+    if lane_id is None and attributes.get("id", "").isdecimal():
+        lane_id = int(attributes["id"])
+    return LabelledLane(points, lane_id, int(position) if _POSITION.fullmatch(position) else None, kind, color)
 
 
-def _track_entries(export: _Export) -> Entries:
-    """The frames in which a track has a polyline that is in view."""
+def _track_entries(export: _Export) -> LabelEntries:
+    """Yields the frames in which a track has a visible polyline."""
     frames: dict[int, dict[str, LabelledLane]] = {}
     for track in export.root.iterfind("track"):
         where = f"track {track.get('id')}"
@@ -125,30 +130,30 @@ def _track_entries(export: _Export) -> Entries:
                 lane = _lane(shape, where, track.get("label", ""), int(track.attrib["id"]))
                 frames.setdefault(int(shape.attrib["frame"]), {})[where] = lane
             except (ValueError, KeyError) as error:
-                yield unusable(f"{export.path}: {where}", error, "an id, and polylines with frame and points")
+                yield field_error(f"{export.path}: {where}", error, "an id, and polylines with frame and points")
     if not frames:
         return
     try:
-        pictures = _Pictures.of(export)
+        task = _VideoTask.of(export)
     except ValueError as error:
-        yield unusable(str(export.path), error, "an original_size of whole numbers")
+        yield field_error(str(export.path), error, "an original_size of whole numbers")
         return
     except LabelError as error:
-        yield placed(str(export.path), error)
+        yield error_at(str(export.path), error)
         return
     for index in sorted(frames):
         place = f"{export.path}: frame {index}"
         try:
-            yield pictures.entry(index, place, frames[index])
+            yield task.entry(index, place, frames[index])
         except LabelError as error:
-            yield placed(place, error)
+            yield error_at(place, error)
 
 
 @dataclass(frozen=True)
-class _Pictures:
-    """Where the frames of a video task are: in the video, or as images that were exported beside the labels.
+class _VideoTask:
+    """A video task and where its frames are: exported as images next to the labels, or else in the video.
 
-    Without a folder `images` beside the labels, the video is looked for there and in the folder `clips`.
+    If there is no folder `images` next to the labels, the video is looked for there and in the folder `clips`.
     """
 
     export: _Export
@@ -157,9 +162,9 @@ class _Pictures:
     size: tuple[int, int] | None
 
     @classmethod
-    def of(cls, export: _Export) -> _Pictures:
+    def of(cls, export: _Export) -> _VideoTask:
         name = export.text("meta/task/source", "meta/source") or export.text("meta/task/name") or export.path.stem
-        source, folder, base = relative(name), export.folder, export.path.parent
+        source, folder, base = path_in_labels(name), export.folder, export.path.parent
         size = [
             export.text(f"meta/task/original_size/{side}", f"meta/original_size/{side}") for side in ("width", "height")
         ]
@@ -168,11 +173,11 @@ class _Pictures:
             video = folder.find(base / source, folder.root / source, folder.root / "clips" / source)
         return cls(export, video, source.stem, size_of(*size) if all(size) else None)
 
-    def entry(self, index: int, place: str, lanes: dict[str, LabelledLane]) -> Entry:
-        """The entry of a frame. Raises LabelError where its image is missing."""
+    def entry(self, index: int, place: str, lanes: dict[str, LabelledLane]) -> LabelEntry:
+        """Returns the entry of a frame. Raises LabelError if its image is missing."""
         if self.video is not None:
-            source, picture = f"{self.video.name}#{index}", Picture(self.video, index)
+            source, image = f"{self.video.name}#{index}", ImageLocation(self.video, index)
         else:
-            image = self.export.folder.picture_of(self.export.path.parent / "images" / f"frame_{index:06d}")
-            source, picture = self.export.folder.name(image), Picture(image)
-        return Entry(place, source, self.group, picture, lanes, self.size)
+            path = self.export.folder.find_image(self.export.path.parent / "images" / f"frame_{index:06d}")
+            source, image = self.export.folder.name(path), ImageLocation(path)
+        return LabelEntry(place, source, self.group, image, lanes, self.size, self.video, index)

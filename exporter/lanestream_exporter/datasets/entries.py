@@ -1,15 +1,16 @@
-"""What the readers of label files give: labelled frames whose points are unchecked and whose pictures are unopened."""
+"""What the readers of label files yield: labeled frames whose points are unchecked and whose images are unopened."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.folder import DataFolder
+from lanestream_exporter.datasets.files import DataFolder
+from lanestream_exporter.datasets.images import ImageLocation
 from lanestream_exporter.datasets.labels import LabelledLane
-from lanestream_exporter.datasets.pictures import Picture
 
 _KINDS: Final[Mapping[str, str]] = {
     **{kind: kind for kind in ("solid", "dashed", "double", "botts", "edge")},
@@ -20,50 +21,64 @@ _KINDS: Final[Mapping[str, str]] = {
     "kerb": "edge",
 }
 _LONGEST_SIDE: Final = 1 << 20  # pixels
-_COLOURS: Final = frozenset({"white", "yellow", "blue", "red", "orange"})
+_COLORS: Final = frozenset({"white", "yellow", "blue", "red", "orange"})
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A labelled frame as its file gives it.
+class LabelEntry:
+    """A labeled frame as its label file describes it.
 
-    `place` is where it stands, `file:line` or `file: element`; `lanes` go by their place within it. `size` is the
-    picture's (width, height) where the labels tell it. `overdrawn` says that the format draws boundaries on beyond the
-    picture. `others` names the kinds of things that are labelled too and are no lines.
+    `place` is where the record stands, `file:line` or `file: element`; the keys of `lanes` are places within it.
+    `size` is the (width, height) of the image if the labels give it. `video` and `index` name the video that the frame
+    was taken from and its number there, if known. `split` is the record's own split. `extends_beyond_image` is true
+    for formats whose boundaries run on outside the image. `others` names labeled shapes that are not lines.
     """
 
     place: str
     source: str
     group: str
-    picture: Picture
+    image: ImageLocation
     lanes: Mapping[str, LabelledLane]
     size: tuple[int, int] | None = None
-    overdrawn: bool = False
+    video: Path | None = None
+    index: int | None = None
+    split: str | None = None
+    extends_beyond_image: bool = False
     others: tuple[str, ...] = ()
 
 
-Entries = Iterator[Entry | LabelError]
-Reader = Callable[[DataFolder], Entries]
+LabelEntries = Iterator[LabelEntry | LabelError]
+
+
+@dataclass(frozen=True)
+class LabelFormat:
+    """A label format: `read` yields the entries of a data set.
+
+    `recognizes` says whether a file holds such labels, by its path and the first bytes of a JSON or XML file.
+    """
+
+    read: Callable[[DataFolder], LabelEntries]
+    recognizes: Callable[[Path, bytes], bool]
 
 
 def numbered(lanes: Iterable[LabelledLane], noun: str = "lane") -> dict[str, LabelledLane]:
-    """Lanes by their place in a list, counted from one."""
+    """Returns lanes by their place in a list, counted from one."""
     return {f"{noun} {number}": lane for number, lane in enumerate(lanes, start=1)}
 
 
 def kind_in(words: Iterable[str]) -> str | None:
-    """The kind of marking that one of `words` names, as this project calls it."""
+    """Returns the kind of marking, in this project's terms, that one of `words` names."""
     return next((_KINDS[word] for word in words if word in _KINDS), None)
 
 
-def colour_in(words: Iterable[str]) -> str | None:
-    """The colour that one of `words` names."""
-    return next((word for word in words if word in _COLOURS), None)
+def color_in(words: Iterable[str]) -> str | None:
+    """Returns the color that one of `words` names."""
+    return next((word for word in words if word in _COLORS), None)
 
 
 def size_of(width: Any, height: Any) -> tuple[int, int]:
-    """A picture's size as labels tell it. Raises ValueError or TypeError where it is none."""
+    """Returns an image size from the labels. Raises ValueError or TypeError if it is not a valid one."""
     size = int(width), int(height)
     if not all(0 < side < _LONGEST_SIDE for side in size):
-        raise ValueError(f"{str(width)[:12]} x {str(height)[:12]} is no size of a picture")
+        raise ValueError(f"{str(width)[:12]} x {str(height)[:12]} is not a valid image size")
     return size

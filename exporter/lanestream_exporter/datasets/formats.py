@@ -1,68 +1,75 @@
-"""The forms of labels that can be read, and telling them apart by their files."""
+"""The table of label formats, and recognizing the format of a data set by its files."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets import caltech, culane
-from lanestream_exporter.datasets.caltech import caltech_entries
-from lanestream_exporter.datasets.clips import clip_entries
-from lanestream_exporter.datasets.culane import culane_entries
-from lanestream_exporter.datasets.cvat import cvat_entries
-from lanestream_exporter.datasets.entries import Reader
-from lanestream_exporter.datasets.folder import DataFolder
-from lanestream_exporter.datasets.labelme import labelme_entries
+from lanestream_exporter.datasets.caltech import caltech_entries, is_caltech
+from lanestream_exporter.datasets.clips import clip_entries, is_clip_labels
+from lanestream_exporter.datasets.culane import culane_entries, is_culane
+from lanestream_exporter.datasets.cvat import cvat_entries, is_cvat
+from lanestream_exporter.datasets.entries import LabelFormat
+from lanestream_exporter.datasets.files import DataFolder
+from lanestream_exporter.datasets.labelme import is_labelme, labelme_entries
 from lanestream_exporter.datasets.masks import is_mask, mask_entries
-from lanestream_exporter.datasets.tusimple import tusimple_entries
+from lanestream_exporter.datasets.tusimple import is_tusimple, tusimple_entries
 
-FORMATS: Final[Mapping[str, Reader]] = {
-    "tusimple": tusimple_entries,
-    "culane": culane_entries,
-    "caltech": caltech_entries,
-    "labelme": labelme_entries,
-    "cvat": cvat_entries,
-    "masks": mask_entries,
-    "clips": clip_entries,
+# A file belongs to the first format that recognizes it.
+FORMATS: Final[Mapping[str, LabelFormat]] = {
+    "tusimple": LabelFormat(tusimple_entries, is_tusimple),
+    "culane": LabelFormat(culane_entries, is_culane),
+    "caltech": LabelFormat(caltech_entries, is_caltech),
+    "labelme": LabelFormat(labelme_entries, is_labelme),
+    "cvat": LabelFormat(cvat_entries, is_cvat),
+    "masks": LabelFormat(mask_entries, is_mask),
+    "clips": LabelFormat(clip_entries, is_clip_labels),
 }
-_ACCEPTED: Final = f"{', '.join(FORMATS)} are read; say which with --format"
-_PEEK: Final = 1 << 16  # bytes of a JSON or XML file that are looked at
-_PEEKED_FILES: Final = 100
+AUTO: Final = "auto"
+
+_TEXT_SUFFIXES: Final = (".json", ".jsonl", ".xml")
+_START_BYTES: Final = 1 << 16  # of a JSON or XML file, to recognize it by
+_MOST_TEXT_FILES: Final = 100  # read to recognize a data set
 
 
-def detect(folder: DataFolder) -> str:
-    """The form of the labels in `folder`. Raises LabelError where there are none, or of several forms."""
-    found = {
-        "culane": folder.with_suffix(culane.SUFFIX),
-        "caltech": folder.with_suffix(caltech.SUFFIX),
-        "masks": list(filter(is_mask, folder.files)),
-    }
-    names = {name for name, files in found.items() if files}
-    text_files = folder.with_suffix(".json", ".jsonl", ".xml")
-    names |= {name for file in islice(text_files, _PEEKED_FILES) if (name := _told_by(file)) is not None}
-    if not names:
-        raise LabelError(f"no labels that are known in {folder.root}", _ACCEPTED)
-    if len(names) > 1:
+def format_of(folder: DataFolder, name: str = AUTO) -> str:
+    """Returns the format to read `folder` in: `name`, or for "auto" the one that its files have.
+
+    Raises LabelError if `name` is unknown, if no labels are found, or if the files have several formats.
+    """
+    if name in FORMATS:
+        return name
+    if name != AUTO:
+        raise LabelError(f"unknown label format {name!r}", f"{', '.join(FORMATS)} and {AUTO} are accepted")
+    found = _formats_of_files(folder)
+    if not found:
         raise LabelError(
-            f"{folder.root} has labels of several forms: {', '.join(sorted(names))}", "say which with --format"
+            f"no labels of a known format in {folder.root}", f"{', '.join(FORMATS)} are read; name one with --format"
         )
-    return names.pop()
+    if len(found) > 1:
+        raise LabelError(
+            f"{folder.root} has labels of several formats: {', '.join(sorted(found))}", "name one with --format"
+        )
+    return found.pop()
 
 
-def _told_by(path: Path) -> str | None:
-    """The form of a JSON or XML file, by the words at its beginning."""
+def _formats_of_files(folder: DataFolder) -> set[str]:
+    found = set()
+    text_files = 0
+    for path in folder.files:
+        start = b""
+        if path.suffix.lower() in _TEXT_SUFFIXES:
+            text_files += 1
+            start = _start_of(path) if text_files <= _MOST_TEXT_FILES else b""
+        found |= set(next(([name] for name, form in FORMATS.items() if form.recognizes(path, start)), []))
+    return found
+
+
+def _start_of(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            start = file.read(_PEEK)
+            return file.read(_START_BYTES)
     except OSError:
-        return None
-    if path.suffix.lower() == ".xml":
-        return "cvat" if b"<annotations" in start else None
-    if b'"h_samples"' in start:
-        return "tusimple"
-    if b'"shapes"' in start or b'"imagePath"' in start or b'"imageData"' in start:
-        return "labelme"
-    return "clips" if b'"lanes"' in start and (b'"frame"' in start or b'"image"' in start) else None
+        return b""

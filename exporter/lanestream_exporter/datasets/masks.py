@@ -1,10 +1,11 @@
-"""Mask images as labels: PNG files in which the pixels of lane boundaries are not black.
+"""Reads masks: PNG files in which the pixels of lane boundaries are not black.
 
-In a binary mask (one value besides zero) every connected piece is a boundary, a dash as well as a line; pieces that
-touch are taken apart where they meet. In an instance mask every value, or colour, is one boundary with all its dashes.
-A boundary's points are the centroids of its pixels, row by row.
+In a binary mask (one value other than zero) every connected piece is a boundary, whether a dash or a whole line; pieces
+that touch are separated where they meet. In an instance mask every value or color is one boundary with all its dashes.
+The points of a boundary are the centroids of its pixels, row by row.
 
-A mask is masks/NAME.png for images/NAME.jpg (or .png, .webp), sub-folders alike, or NAME_mask.png beside NAME.jpg.
+A mask is masks/NAME.png for images/NAME.jpg (or .png, .webp), with the same subfolders, or NAME_mask.png next to
+NAME.jpg.
 """
 
 from __future__ import annotations
@@ -21,54 +22,54 @@ from scipy.ndimage import binary_fill_holes
 
 from lanestream.errors import ImageError, LabelError
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.datasets.entries import Entries, Entry
-from lanestream_exporter.datasets.folder import IMAGE_FOLDERS, DataFolder, drive_of
+from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry
+from lanestream_exporter.datasets.files import IMAGE_FOLDERS, DataFolder, drive_of, error_at
+from lanestream_exporter.datasets.images import ImageLocation, checked_header, file_bytes
 from lanestream_exporter.datasets.labels import LabelledLane
-from lanestream_exporter.datasets.pictures import Picture, checked_header, file_bytes
-from lanestream_exporter.datasets.records import placed
 
 _MASK_FOLDERS: Final = frozenset({"mask", "masks", "segmentation"})
-_BESIDE: Final = "_mask"
+_STEM_END: Final = "_mask"  # of a mask next to its image
 _MOST_INSTANCES: Final = 32
-_LEAST_ROWS: Final = 3  # fewer are a speck
+_LEAST_ROWS: Final = 3  # a smaller piece is a speck
 
 
-def is_mask(path: Path) -> bool:
-    """Whether `path` is where masks are kept."""
+def is_mask(path: Path, _start: bytes = b"") -> bool:
+    """Whether the file at `path` is a mask, by its folder and name."""
     in_folder = not _MASK_FOLDERS.isdisjoint(path.absolute().parent.parts[-3:])
-    return path.suffix.lower() == ".png" and (in_folder or path.stem.endswith(_BESIDE))
+    return path.suffix.lower() == ".png" and (in_folder or path.stem.endswith(_STEM_END))
 
 
-def mask_entries(folder: DataFolder) -> Entries:
-    """The frames that have a mask; a group is the folder of the images."""
+def mask_entries(folder: DataFolder) -> LabelEntries:
+    """Yields the frames that have a mask. A group is the folder of the images."""
     for path in filter(is_mask, folder.files):
         try:
             image = _image_of(path, folder)
             mask = _read(path)
             lanes = dict(_lanes(mask))
         except (LabelError, ImageError) as error:
-            yield placed(str(path), error)
+            yield error_at(str(path), error)
             continue
         height, width = mask.shape
-        yield Entry(str(path), folder.name(image), drive_of(image.parent), Picture(image), lanes, (width, height))
+        group, size = drive_of(image.parent), (width, height)
+        yield LabelEntry(str(path), folder.name(image), group, ImageLocation(image), lanes, size)
 
 
 def _image_of(mask: Path, folder: DataFolder) -> Path:
-    if mask.stem.endswith(_BESIDE):
-        return folder.picture_of(mask.with_name(mask.stem[: -len(_BESIDE)]))
+    if mask.stem.endswith(_STEM_END):
+        return folder.find_image(mask.with_name(mask.stem[: -len(_STEM_END)]))
     parts = mask.absolute().with_suffix("").parts
     at = max(number for number, part in enumerate(parts[:-1]) if part in _MASK_FOLDERS)
     for name in IMAGE_FOLDERS:
         if Path(*parts[:at], name).is_dir():
-            return folder.picture_of(Path(*parts[:at], name, *parts[at + 1 :]))
-    raise LabelError("there is no folder images beside its own", "masks/NAME.png belongs to images/NAME.jpg")
+            return folder.find_image(Path(*parts[:at], name, *parts[at + 1 :]))
+    raise LabelError("there is no folder images next to its own", "the mask of images/NAME.jpg is masks/NAME.png")
 
 
 def _read(path: Path) -> NDArray[np.int64]:
-    """The mask as one number a pixel (H, W). Raises ImageError where it can't be decoded, or is no PNG file."""
+    """Returns the mask as one number per pixel (H, W). Raises ImageError if it can't be decoded or is not PNG."""
     data = file_bytes(path)
     if checked_header(data).kind != "PNG":
-        raise ImageError("a mask has to be a PNG file: other kinds smear its values")
+        raise ImageError("a mask must be a PNG file: other formats blur its values")
     try:
         mask = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -85,7 +86,7 @@ def _lanes(mask: NDArray[np.int64]) -> Iterator[tuple[str, LabelledLane]]:
     values = [value for value in np.unique(mask) if value]
     if len(values) > _MOST_INSTANCES:
         raise LabelError(
-            f"it has {len(values)} different values", "a mask has one value, or one a boundary, with hard edges"
+            f"it has {len(values)} different values", "a mask has one value, or one value per boundary, with hard edges"
         )
     if len(values) == 1:
         for number, points in enumerate(_pieces(mask != 0), start=1):
@@ -96,7 +97,7 @@ def _lanes(mask: NDArray[np.int64]) -> Iterator[tuple[str, LabelledLane]]:
 
 
 def _centroids(pixels: NDArray[np.bool_]) -> FloatArray:
-    """The mean column of the pixels in each row that has some, from below upwards (N, 2)."""
+    """Returns the mean column of the pixels in each row that has some, from the lowest row upwards (N, 2)."""
     counts = pixels.sum(axis=1)
     rows = np.flatnonzero(counts)[::-1]
     means = (pixels @ np.arange(pixels.shape[1]))[rows] / counts[rows]
@@ -105,57 +106,57 @@ def _centroids(pixels: NDArray[np.bool_]) -> FloatArray:
 
 @dataclass(eq=False)
 class _Piece:
-    """Runs of pixels one above the other: a boundary as far as it is traced."""
+    """A boundary as far as it has been traced upwards, one run of pixels per row; [start, end) is the top run."""
 
     start: int = 0
     end: int = 0
     points: list[tuple[float, float]] = field(default_factory=list)
-    merged: bool = False  # begun where several met: no single boundary any more
+    merged: bool = False  # starts where several pieces met, so it is not a single boundary
 
     def extend(self, start: int, end: int, row: int) -> None:
-        """Goes on with the run [start, end) of a row."""
+        """Adds the run [start, end) of the next row."""
         self.start, self.end = start, end
         self.points.append(((start + end - 1) / 2.0, float(row)))
 
-    def heir(self, runs: list[tuple[int, int]]) -> int | None:
-        """Which of the next row's runs goes on with this one: the one that touches it most, be it by a corner."""
+    def next_run(self, runs: list[tuple[int, int]]) -> int | None:
+        """Returns the index of the run in the next row that touches this piece most, at least by a corner."""
         shared = [min(end, self.end) - max(start, self.start) for start, end in runs]
         best = int(np.argmax(shared)) if shared else None
         return best if best is not None and shared[best] >= 0 else None
 
     @property
-    def grown(self) -> bool:
+    def is_large(self) -> bool:
         """Whether it is more than a speck."""
         return len(self.points) >= _LEAST_ROWS
 
 
 def _pieces(pixels: NDArray[np.bool_]) -> Iterator[FloatArray]:
-    """Connected pieces as points from below upwards; pieces that meet end there, and what follows is left out."""
+    """Yields connected pieces as points upwards. Pieces end where they meet, and what lies above is left out."""
     filled = binary_fill_holes(pixels)
-    alive: list[_Piece] = []
+    open_pieces: list[_Piece] = []
     for row in range(len(filled) - 1, -1, -1):
         runs = _runs(filled[row])
-        heirs = [piece.heir(runs) for piece in alive]
+        next_runs = [piece.next_run(runs) for piece in open_pieces]
         above = []
         for number, run in enumerate(runs):
-            below = [piece for piece, heir in zip(alive, heirs, strict=True) if heir == number]
-            # Specks at a ragged edge don't count as something that is met.
-            below = [piece for piece in below if piece.grown] or below[:1]
+            below = [piece for piece, follows in zip(open_pieces, next_runs, strict=True) if follows == number]
+            # Specks at a ragged edge are not pieces that meet.
+            below = [piece for piece in below if piece.is_large] or below[:1]
             piece = below[0] if len(below) == 1 else _Piece(merged=bool(below))
             piece.extend(*run, row)
             above.append(piece)
-        yield from _finished([piece for piece in alive if piece not in above])
-        alive = above
-    yield from _finished(alive)
+        yield from _finished([piece for piece in open_pieces if piece not in above])
+        open_pieces = above
+    yield from _finished(open_pieces)
 
 
 def _runs(line: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """(start, end) of each run of set pixels in a row, the end exclusive."""
+    """Returns (start, end) of each run of set pixels in a row, the end exclusive."""
     steps = np.flatnonzero(np.diff(np.concatenate([[False], line, [False]]).astype(np.int8)))
     return [(int(start), int(end)) for start, end in steps.reshape(-1, 2)]
 
 
 def _finished(pieces: list[_Piece]) -> Iterator[FloatArray]:
     for piece in pieces:
-        if piece.grown and not piece.merged:
+        if piece.is_large and not piece.merged:
             yield np.array(piece.points)

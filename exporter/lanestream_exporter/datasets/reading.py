@@ -1,4 +1,4 @@
-"""Labelled frames of any form that is known, with their pictures: the way in for everything that learns or measures."""
+"""Reads labeled frames of every known format together with their images."""
 
 from __future__ import annotations
 
@@ -8,96 +8,104 @@ from pathlib import Path
 
 from lanestream.errors import LabelError, LanestreamError
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.entries import Entry
-from lanestream_exporter.datasets.folder import DataFolder
-from lanestream_exporter.datasets.formats import FORMATS, detect
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
-from lanestream_exporter.datasets.pictures import Opener
-from lanestream_exporter.datasets.polylines import sound, within
-from lanestream_exporter.datasets.records import placed
+from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry
+from lanestream_exporter.datasets.files import DataFolder, error_at
+from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
+from lanestream_exporter.datasets.images import ImageReader
+from lanestream_exporter.datasets.labels import (
+    PARTIAL,
+    Coverage,
+    LabelledFrame,
+    LabelledImages,
+    LabelledLane,
+    checked_points,
+    points_inside,
+)
 
 
 @dataclass(frozen=True)
-class Sample:
-    """A labelled frame that can be used: its record, its labels and its picture, BGR (H, W, 3) uint8."""
+class LabelledSample:
+    """A usable labeled frame: its record, its labels and its image, BGR (H, W, 3) uint8."""
 
-    entry: Entry
+    entry: LabelEntry
     frame: LabelledFrame
     image: Image
 
 
-def read_dataset(path: Path, format: str = "auto") -> Iterator[tuple[LabelledFrame, Image]]:  # noqa: A002
-    """The labelled frames of the data set at `path`, a folder or a label file, each with its picture.
+def read_dataset(path: Path, format: str = AUTO) -> LabelledImages:  # noqa: A002
+    """Yields the labeled frames of the data set at `path`, a folder or a label file, with their images.
 
-    Pictures are BGR (H, W, 3) uint8, decoded as they are asked for. Points of a lane go from the lowest row upwards, in
-    pixels of the picture. `frame.group` names the drive or clip, which a split may not divide. `format` is one of
-    `formats.FORMATS`, or "auto". Raises LabelError at the first record that can't be used, naming its file and line.
+    Images are BGR (H, W, 3) uint8 and decoded one at a time. `frame.group` names the drive or clip. `format` is one of
+    `formats.FORMATS`, or "auto". Raises LabelError at the first unusable record, with its file and line.
     """
-    for sample in survey(path, format):
+    for sample in scan_dataset(path, format):
         if isinstance(sample, LabelError):
             raise sample
         yield sample.frame, sample.image
 
 
-def survey(path: Path, format: str = "auto") -> Iterator[Sample | LabelError]:  # noqa: A002
-    """As `read_dataset`, but what is wrong with a record is yielded, every fault of it, and the next one follows.
+def scan_dataset(path: Path, format: str = AUTO) -> Iterator[LabelledSample | LabelError]:  # noqa: A002
+    """Yields the samples of the data set at `path`, and every fault of an unusable record instead of raising it.
 
-    Raises LabelError where there is no data set at `path`, or its form can't be told.
+    Raises LabelError if there is no data set at `path`, or if its format can't be recognized.
+    """
+    with ImageReader() as images:
+        for entry in read_entries(path, format):
+            yield from [entry] if isinstance(entry, LabelError) else open_entry(entry, images)
+
+
+def read_entries(path: Path, format: str = AUTO) -> LabelEntries:  # noqa: A002
+    """Yields the records of the data set at `path` without opening its images, and unusable ones as their errors.
+
+    Raises LabelError if there is no data set at `path`, or if its format can't be recognized.
     """
     folder = DataFolder.at(path)
-    name = form_of(folder, format)
+    name = format_of(folder, format)
     empty = True
-    with Opener() as opener:
-        for entry in FORMATS[name](folder):
-            empty = False
-            if isinstance(entry, LabelError):
-                yield entry
-            else:
-                yield from _opened(entry, opener)
+    for entry in FORMATS[name].read(folder):
+        empty = False
+        yield entry
     if empty:
-        raise LabelError(f"no labelled frames in {path} as {name}")
+        raise LabelError(f"no labeled frames of format {name} in {path}")
 
 
-def form_of(folder: DataFolder, format: str) -> str:  # noqa: A002
-    """The name of the form to read `folder` in. Raises LabelError where `format` is unknown or can't be told."""
-    if format == "auto":
-        return detect(folder)
-    if format not in FORMATS:
-        raise LabelError(f"the form of labels {format!r} is unknown", f"{', '.join(FORMATS)} or auto are accepted")
-    return format
-
-
-def _opened(entry: Entry, opener: Opener) -> Iterator[Sample | LabelError]:
-    """The sample of an entry, or all that is wrong with it."""
-    faults, lanes = [], []
+def open_entry(
+    entry: LabelEntry, images: ImageReader, coverage: Coverage = PARTIAL
+) -> Iterator[LabelledSample | LabelError]:
+    """Yields the sample of an entry, or everything that is wrong with it."""
+    faults: list[LabelError] = []
     image, size = None, entry.size
     try:
-        image = opener.open(entry.picture)
+        image = images.open(entry.image)
     except LanestreamError as error:
-        faults.append(placed(f"{entry.place}: {entry.source}", error))
+        faults.append(error_at(f"{entry.place}: {entry.source}", error))
     else:
-        real = image.shape[1], image.shape[0]
-        size = size or real
-        if size != real:
-            are, told = (" x ".join(map(str, pair)) for pair in (real, size))
-            faults.append(LabelError(f"{entry.place}: {entry.source} is {are}, but its labels are for {told}"))
-    if size is not None:
-        for where, lane in entry.lanes.items():
-            try:
-                lanes.append(_sound_lane(lane, size, entry.overdrawn))
-            except ValueError as error:
-                faults.append(LabelError(f"{entry.place}: {where}: {error}"))
+        actual = image.shape[1], image.shape[0]
+        size = size or actual
+        if size != actual:
+            one, other = (" x ".join(map(str, pair)) for pair in (actual, size))
+            faults.append(LabelError(f"{entry.place}: {entry.source} is {one}, but its labels are for {other}"))
+    frame, lane_faults = labelled_frame(entry, size, coverage) if size is not None else (None, [])
+    faults += lane_faults
     yield from faults
-    if image is not None and size is not None and not faults:
-        kept = tuple(lane for lane in lanes if lane is not None)
-        yield Sample(entry, LabelledFrame(*size, kept, entry.group, entry.source), image)
+    if image is not None and frame is not None and not faults:
+        yield LabelledSample(entry, frame, image)
 
 
-def _sound_lane(lane: LabelledLane, size: tuple[int, int], overdrawn: bool) -> LabelledLane | None:
-    """The lane with sound points; None where a form that draws on beyond the picture leaves nothing inside it."""
-    points = lane.points
-    if overdrawn and len(points) >= 2:
-        points = within(points, *size)
-        if len(points) < 2:
-            return None
-    return replace(lane, points=sound(points, *size))
+def labelled_frame(
+    entry: LabelEntry, size: tuple[int, int], coverage: Coverage
+) -> tuple[LabelledFrame, list[LabelError]]:
+    """Returns the labels of an entry for an image of `size` (width, height), and what is wrong with its lanes."""
+    lanes: list[LabelledLane] = []
+    faults = []
+    for name, lane in entry.lanes.items():
+        points = lane.points
+        if entry.extends_beyond_image and len(points) >= 2:
+            points = points_inside(points, *size)
+            if len(points) < 2:
+                continue
+        try:
+            lanes.append(replace(lane, points=checked_points(points, *size)))
+        except ValueError as error:
+            faults.append(LabelError(f"{entry.place}: {name}: {error}"))
+    return LabelledFrame(*size, tuple(lanes), entry.group, entry.source, coverage), faults

@@ -1,131 +1,143 @@
-"""Which real frames may be trained on, which choose and calibrate, and which are for reporting alone."""
+"""Split rules: which labeled frames train, which validate, and which are only reported on.
+
+Neighboring frames look alike. A drive or clip in two splits would test a network on what it memorized, so frames are
+divided by drive, and the rules that cut a drive say so explicitly.
+"""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from pathlib import Path
-from typing import Literal
+from itertools import combinations, pairwise
+from typing import Annotated, Any, Final, Literal, Self, get_args
 
-import cv2
 import numpy as np
+from pydantic import BeforeValidator, Field, NonNegativeInt, model_validator
 
 from lanestream.errors import LabelError
-from lanestream.road.view import Image
-from lanestream_exporter.datasets.clips import read_clip, read_clip_labels
-from lanestream_exporter.datasets.label_propagation import Between
-from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, Coverage, LabelledFrame
-from lanestream_exporter.datasets.records import records
-from lanestream_exporter.datasets.tusimple import read_tusimple
+from lanestream_exporter.datasets.entries import LabelEntry
+from lanestream_exporter.toml_files import Section
 
 Split = Literal["train", "val", "test"]
+SPLITS: Final[tuple[Split, ...]] = get_args(Split)
 
-# Left of the yellow line of the first two is a barrier: what looks like a boundary there is none.
-_CLIPS: dict[Split, dict[str, Coverage]] = {
-    "train": {"highway_project_8s": Coverage(open_sides=(1,)), "highway_concrete": Coverage(open_sides=(1,))},
-    "val": {},
-    "test": {"highway_white_right": PARTIAL},
-}
+# Longer than any video.
+_WHOLE_VIDEO: Final = range(1_000_000)
 
-# The country road is one drive: cut by time, with the stretch between two parts left out of neither but never shared.
-_COUNTRY_FRAMES: dict[Split, range] = {"train": range(2000), "val": range(2000, 2400), "test": range(2400, 2800)}
+FrameRange = tuple[NonNegativeInt, NonNegativeInt]
 
 
-def data_root(given: Path | None = None) -> Path:
-    """The folder of real frames: the `given` one, else `$LANESTREAM_DATA`, else `../shared/data`.
+class WholeSplit(Section):
+    """The whole data set is in one split. In the file: `split = "train"`."""
 
-    Raises LabelError where no labelled frames are in it.
+    by: Literal["whole"]
+    split: Split
+
+
+class RecordSplit(Section):
+    """Each record of the label file has a field `split`."""
+
+    by: Literal["record"]
+
+
+class FrameSplit(Section):
+    """The videos are cut by frame numbers: from the first of a range up to, but not including, the second."""
+
+    by: Literal["frame"]
+    train: FrameRange | None = None
+    val: FrameRange | None = None
+    test: FrameRange | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        ranges = sorted((part for part in map(self.range_of, SPLITS) if part), key=lambda part: part.start)
+        if not ranges:
+            raise ValueError("none of train, val and test has frames; give a range such as train = [0, 2000]")
+        if any(before.stop > after.start for before, after in pairwise(ranges)):
+            raise ValueError("the ranges of train, val and test overlap")
+        return self
+
+    def range_of(self, split: Split) -> range:
+        """Returns the frames of a split, empty if it has none."""
+        first, end = getattr(self, split) or (0, 0)
+        return range(first, end)
+
+
+class GroupSplit(Section):
+    """Whole drives, drawn with `seed`, validate: about the share `val` of all frames. The others train."""
+
+    by: Literal["group"]
+    val: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.2
+    seed: NonNegativeInt = 0
+
+
+def _whole(value: Any) -> Any:
+    """Returns the table that `split = "train"` stands for."""
+    if not isinstance(value, str):
+        return value
+    if value not in SPLITS:
+        raise ValueError(f"{value!r} is not a split; accepted are {', '.join(SPLITS)}, or a table with the key `by`")
+    return {"by": "whole", "split": value}
+
+
+SplitRule = WholeSplit | RecordSplit | FrameSplit | GroupSplit
+SplitField = Annotated[Annotated[SplitRule, Field(discriminator="by")], BeforeValidator(_whole)]
+
+
+def split_of(rule: SplitRule, entry: LabelEntry, validation_groups: frozenset[str]) -> Split | None:
+    """Returns the split of an entry, None if it is in none; `validation_groups` are those that a GroupSplit drew.
+
+    Raises LabelError if the labels lack what the rule needs.
     """
-    root = given or Path(os.environ.get("LANESTREAM_DATA", "../shared/data"))
-    if not (root / "tusimple" / "labels.jsonl").is_file():
-        raise LabelError(f"no labelled frames in {root}", "give the data folder with --data or in LANESTREAM_DATA")
-    return root
+    if isinstance(rule, WholeSplit):
+        return rule.split
+    if isinstance(rule, GroupSplit):
+        return "val" if entry.group in validation_groups else "train"
+    if isinstance(rule, RecordSplit):
+        if entry.split not in SPLITS:
+            found = "the record has no split" if entry.split is None else f"{entry.split!r} is not a split"
+            raise LabelError(
+                f"{entry.place}: {found}",
+                f"a field `split` with {', '.join(SPLITS)} is accepted, or another split rule in the manifest",
+            )
+        return entry.split
+    if entry.index is None:
+        raise LabelError(
+            f"{entry.place}: {entry.source} has no frame number", "frames can only be split by number if labels give it"
+        )
+    return next((split for split in SPLITS if entry.index in rule.range_of(split)), None)
 
 
-def real_frames(root: Path, split: Split) -> Iterator[tuple[LabelledFrame, Image]]:
-    """All labelled real frames of a split with their BGR images, drive after drive."""
-    yield from read_tusimple(root / "tusimple", split)
-    for clip in _highway_clips(root, split):
-        yield from read_clip(clip.video, clip.labels, clip.coverage)
-    yield from _country_frames(root / "udacity_ch2", _COUNTRY_FRAMES[split])
-
-
-def training_frames(root: Path, between: Between | None) -> Iterator[tuple[LabelledFrame, Image]]:
-    """The frames of the training split, and those that `between` labels from them, drive after drive."""
-    yield from real_frames(root, "train")
-    if between is None:
-        return
-    for clip in labelled_clips(root, "train"):
-        labelled = read_clip_labels(clip.labels, clip.coverage)
-        yield from between.frames(clip.video, {i: frame for i, frame in labelled.items() if i in clip.frames})
-
-
-@dataclass(frozen=True)
-class LabelledClip:
-    """A video with key-frame labels, what they cover, and the stretch of its frames that belongs to a split."""
-
-    name: str
-    video: Path
-    labels: Path
-    frames: range
-    coverage: Coverage = PARTIAL
-
-
-def highway_clip(root: Path, name: str, coverage: Coverage = PARTIAL) -> LabelledClip:
-    """One of the labelled highway clips, whole."""
-    video, labels = root / "udacity/clips" / f"{name}.mp4", root / "udacity/labels" / f"{name}.jsonl"
-    return LabelledClip(name, video, labels, range(1_000_000), coverage)
-
-
-def labelled_clips(root: Path, split: Split) -> list[LabelledClip]:
-    """The clips of a split: highways and the country road's stretch."""
-    country = root / "udacity_ch2"
-    video, labels = country / "country_road_140s.mp4", country / "labels.jsonl"
-    return [
-        *_highway_clips(root, split),
-        LabelledClip("country_road", video, labels, _COUNTRY_FRAMES[split], EGO_LANE),
-    ]
-
-
-def _highway_clips(root: Path, split: Split) -> list[LabelledClip]:
-    return [highway_clip(root, name, coverage) for name, coverage in _CLIPS[split].items()]
-
-
-def _country_frames(root: Path, wanted: range) -> Iterator[tuple[LabelledFrame, Image]]:
-    """Labelled frames of the country road from the original JPEGs, which the video has compressed once more."""
-    labels = root / "labels.jsonl"
-    images = {int(record["frame"]): str(record["image"]) for _, record in records(labels)}
-    for index, frame in read_clip_labels(labels, EGO_LANE).items():
-        if index in wanted:
-            image = cv2.imread(str(root / images[index]))
-            if image is None:
-                raise LabelError(f"{labels}: {images[index]} can't be read as an image")
-            yield frame, np.asarray(image, dtype=np.uint8)
+def clip_frames(rule: SplitRule, split: Split, labelled: Sequence[int]) -> range:
+    """Returns the frames of a video that belong to `split`; `labelled` are the indices of its labeled frames there."""
+    if isinstance(rule, FrameSplit):
+        return rule.range_of(split)
+    if isinstance(rule, RecordSplit):
+        return range(min(labelled), max(labelled) + 1)
+    return _WHOLE_VIDEO
 
 
 @dataclass(frozen=True)
-class GroupSplit:
-    """Which drives or clips are trained on, and which choose and calibrate."""
+class GroupDivision:
+    """The drives or clips that are trained on, and those that validate."""
 
     train: frozenset[str]
     validation: frozenset[str]
 
 
-def split_by_group(groups: Iterable[str], validation_share: float, seed: int = 0) -> GroupSplit:
-    """Divides frames by drive or clip; `groups` has the `frame.group` of every frame, in any order.
+def split_by_group(groups: Iterable[str], validation_share: float, seed: int = 0) -> GroupDivision:
+    """Divides frames by drive or clip; `groups` has the group of every frame, in any order.
 
-    Whole groups in an order drawn with `seed` go to validation, as many as come nearest to `validation_share` (0 to 1)
-    of all frames; each side has a group at least. The same frames and seed give the same split.
-    Raises LabelError where there are fewer than two groups, because one can't be divided.
+    Whole groups, in an order drawn with `seed`, go to validation until their frames come closest to
+    `validation_share` (0 to 1) of all. Each side gets at least one group. The result is reproducible.
+    Raises LabelError for fewer than two groups.
     """
     sizes = Counter(groups)
     if len(sizes) < 2:
         raise LabelError(
-            f"there is no split of {len(sizes)} drive or clip by drive",
-            "frames of two at least are needed: put each into a folder of its own",
+            f"{len(sizes)} drive or clip can't be split by drive",
+            "frames of at least two are needed: put each into a folder of its own",
         )
     wanted = validation_share * sizes.total()
     names = sorted(sizes)
@@ -136,7 +148,7 @@ def split_by_group(groups: Iterable[str], validation_share: float, seed: int = 0
         if taken + sizes[name] <= wanted:
             validation.add(name)
             taken += sizes[name]
-    # One more where a little too much is nearer than a little too few.
+    # One more group if slightly too many frames are closer to the share than slightly too few.
     left = [name for name in order if name not in validation]
     if left and abs(taken + (least := min(sizes[name] for name in left)) - wanted) < wanted - taken:
         validation.add(next(name for name in left if sizes[name] == least))
@@ -144,19 +156,16 @@ def split_by_group(groups: Iterable[str], validation_share: float, seed: int = 0
         validation.add(min(order, key=lambda name: sizes[name]))
     if len(validation) == len(names):
         validation.remove(max(order, key=lambda name: sizes[name]))
-    return GroupSplit(frozenset(names) - validation, frozenset(validation))
+    return GroupDivision(frozenset(names) - validation, frozenset(validation))
 
 
 def refuse_leak(train: Iterable[str], validation: Iterable[str], test: Iterable[str] = ()) -> None:
-    """Raises LabelError where a drive or clip is in more than one part; each part is the `frame.group` of its frames.
-
-    Neighbouring frames look alike, so that a drive on both sides would be a test on what was learnt by heart.
-    """
+    """Raises LabelError if a drive or clip is in more than one part; each part has the groups of its frames."""
     parts = {"train": set(train), "validation": set(validation), "test": set(test)}
     for (one, left), (other, right) in combinations(parts.items(), 2):
         if shared := sorted(left & right):
             more = f" and {len(shared) - 1} more" if len(shared) > 1 else ""
             raise LabelError(
                 f"{shared[0]!r}{more} is in both {one} and {other}",
-                "a drive or clip may be on one side of a split only",
+                "put each drive or clip on one side of a split only",
             )

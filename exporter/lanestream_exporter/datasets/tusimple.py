@@ -1,74 +1,63 @@
-"""TuSimple's labels: columns of each lane at fixed rows, -2 where it is absent.
+"""Reads TuSimple's labels: the columns of each lane at fixed rows, -2 where a lane is absent.
 
-Format: github.com/TuSimple/tusimple-benchmark, lane detection challenge.
+Format: github.com/TuSimple/tusimple-benchmark, lane detection challenge. A record may have a `split`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Final
 
-import cv2
 import numpy as np
 
 from lanestream.errors import LabelError
-from lanestream.road.view import Image
-from lanestream_exporter.datasets.entries import Entries, Entry, numbered
-from lanestream_exporter.datasets.folder import DataFolder, drive_of, relative
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
-from lanestream_exporter.datasets.pictures import Picture
-from lanestream_exporter.datasets.records import all_records, placed, records, unusable
+from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, numbered
+from lanestream_exporter.datasets.files import (
+    DataFolder,
+    drive_of,
+    error_at,
+    field_error,
+    path_in_labels,
+    scan_json_lines,
+)
+from lanestream_exporter.datasets.images import ImageLocation
+from lanestream_exporter.datasets.labels import LabelledLane
 
-_WIDTH, _HEIGHT = 1280, 720
-_NEEDED = "raw_file, h_samples and lanes"
-
-
-def read_tusimple(root: Path, split: str | None = None) -> Iterator[tuple[LabelledFrame, Image]]:
-    """Labelled frames below `root` with their BGR images (720, 1280, 3); `split` picks train, val or test.
-
-    Labels are not exhaustive: what lies outside the outermost one is unknown. Raises LabelError that names the file and
-    the line.
-    """
-    for place, record in records(root / "labels.jsonl"):
-        try:
-            if split is not None and record["split"] != split:
-                continue
-            lanes, source = tuple(_lanes(record)), str(record["raw_file"])
-        except (ValueError, KeyError, TypeError, OverflowError) as error:
-            raise unusable(place, error, f"split, {_NEEDED}") from error
-        image = cv2.imread(str(root / source))
-        if image is None:
-            raise LabelError(f"{place}: {source} can't be read as an image")
-        yield LabelledFrame(_WIDTH, _HEIGHT, lanes, "tusimple 0313-1", source), np.asarray(image, dtype=np.uint8)
+_NEEDED: Final = "raw_file, h_samples and lanes"
 
 
-def tusimple_entries(folder: DataFolder) -> Entries:
-    """The frames of TuSimple's files of JSON lines; a group is a drive, as in clips/0313-1/6040/20.jpg."""
+def is_tusimple(path: Path, start: bytes) -> bool:
+    """Whether the file at `path` holds TuSimple labels, by its first bytes."""
+    return path.suffix.lower() in (".json", ".jsonl") and b'"h_samples"' in start
+
+
+def tusimple_entries(folder: DataFolder) -> LabelEntries:
+    """Yields the frames of TuSimple's JSON lines files. A group is a drive: 0313-1 of clips/0313-1/6040/20.jpg."""
     for path in folder.with_suffix(".json", ".jsonl"):
-        for place, record in all_records(path):
+        for place, record in scan_json_lines(path):
             if isinstance(record, LabelError):
                 yield record
                 continue
             try:
                 yield _entry(record, place, path, folder)
             except (ValueError, KeyError, TypeError, OverflowError) as error:
-                yield unusable(place, error, _NEEDED)
+                yield field_error(place, error, _NEEDED)
             except LabelError as error:
-                yield placed(place, error)
+                yield error_at(place, error)
 
 
-def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -> Entry:
-    name = relative(record["raw_file"])
+def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -> LabelEntry:
+    name = path_in_labels(record["raw_file"])
     lanes = numbered(_lanes(record))
     image = folder.find(path.parent / name, folder.root / name)
     official = PurePosixPath(str(record.get("source", name.as_posix()))).parts
     group = f"tusimple {official[1]}" if official[:1] == ("clips",) and len(official) > 3 else drive_of(image.parent)
-    return Entry(place, folder.name(image), group, Picture(image), lanes)
+    return LabelEntry(place, folder.name(image), group, ImageLocation(image), lanes, split=record.get("split"))
 
 
 def _lanes(record: dict[str, Any]) -> Iterator[LabelledLane]:
-    """The lanes that are there: a column below zero is absent, and what is left at one row alone is no boundary."""
+    """Yields the lanes that are present. A column below zero is absent; a lane with one row left is dropped."""
     rows = np.asarray(record["h_samples"], dtype=float)
     for number, columns in enumerate(record["lanes"], start=1):
         x = np.asarray(columns, dtype=float)

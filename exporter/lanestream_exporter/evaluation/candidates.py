@@ -11,7 +11,7 @@ from sklearn.metrics import average_precision_score
 
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
-from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, RULES, FrameOutcome, JudgedCandidates
+from lanestream_exporter.evaluation.outcomes import MOST_RANKED, RULES, FrameOutcome, JudgedCandidates
 from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE
 
 _BINS = 10
@@ -100,8 +100,8 @@ def _proposed(outcomes: Sequence[FrameOutcome], ego: bool) -> dict[str, Any]:
     labels = [[p for p in judged.proposed if p.ego or not ego] for judged in _all(outcomes)]
     frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
     ranks = [[p.rank for p in frame if p.rank is not None] for frame in labels]
-    reached = np.array([np.bincount(p, minlength=MOST_CANDIDATES).cumsum() for p in map(_integers, ranks)])
-    counts = np.column_stack([reached.reshape(-1, MOST_CANDIDATES), [len(frame) for frame in labels]])
+    reached = np.array([np.bincount(p, minlength=MOST_RANKED).cumsum() for p in map(_integers, ranks)])
+    counts = np.column_stack([reached.reshape(-1, MOST_RANKED), [len(frame) for frame in labels]])
     total = counts.sum(axis=0)
     return {
         "labels": int(total[-1]),

@@ -1,8 +1,8 @@
-"""One evaluation: the same frames through every method, and all figures of it."""
+"""Runs an evaluation: the same frames through every method, and all figures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ import numpy as np
 
 from lanestream.errors import LabelError, SourceError
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.clips import read_clip_labels
-from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.splits import LabelledClip, Split, labelled_clips, real_frames
+from lanestream_exporter.datasets.labels import LabelledImages
+from lanestream_exporter.datasets.manifest import DatasetCollection, LabelledClip
+from lanestream_exporter.datasets.splits import Split
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
@@ -26,26 +26,24 @@ from lanestream_exporter.evaluation.steadiness import steadiness
 SCHEMA = 2
 OVERALL = "overall"
 
-Frames = Callable[[], Iterable[tuple[LabelledFrame, Image]]]
-
 
 @dataclass(frozen=True)
-class Material:
-    """What is measured on: single labelled images, read anew at each call of `images`, and labelled clips."""
+class EvaluationSet:
+    """What is evaluated on: single labeled images, read again at each call of `images`, and labeled clips."""
 
     name: str
-    images: Frames
+    images: Callable[[], LabelledImages]
     clips: tuple[LabelledClip, ...] = ()
 
     @classmethod
-    def of_split(cls, root: Path, split: Split) -> Material:
-        """The project's own frames of a split, below the data folder `root`."""
-        return cls(split, lambda: real_frames(root, split), tuple(labelled_clips(root, split)))
+    def of_split(cls, datasets: DatasetCollection, split: Split) -> EvaluationSet:
+        """Returns a split of the data sets of a manifest. Raises LabelError for a bad record."""
+        return cls(split, lambda: datasets.frames(split), tuple(datasets.clips(split)))
 
 
 @dataclass
 class ClipRun:
-    """A clip as one method saw it: every frame of it in order, and its labelled frames with the memory and without."""
+    """One method's results on a clip: every frame in order, and the labeled frames with and without tracking."""
 
     reported: list[tuple[ReportedBoundary, ...]] = field(default_factory=list)
     tracked: list[FrameOutcome] = field(default_factory=list)
@@ -53,7 +51,7 @@ class ClipRun:
     size: tuple[int, int] = (1, 1)
 
     def figures(self) -> dict[str, Any]:
-        """Level B both ways, and steadiness."""
+        """Returns the level B figures with and without tracking, and the steadiness."""
         return {
             "tracked": boundary_figures(self.tracked),
             "alone": boundary_figures(self.alone),
@@ -63,28 +61,28 @@ class ClipRun:
 
 @dataclass
 class Evaluation:
-    """The outcomes of every method: by method on images, by method and clip on clips."""
+    """The outcomes of every method: on images by method, on clips by method and clip."""
 
-    material: Material
+    evaluation_set: EvaluationSet
     methods: tuple[Method, ...]
     images: dict[str, list[FrameOutcome]]
     clips: dict[str, dict[str, ClipRun]]
 
     def figures(self) -> dict[str, Any]:
-        """All figures, as written to the JSON file: every key is in docs/evaluation.md."""
+        """Returns all figures as written to the JSON file; docs/evaluation.md documents every key."""
         return {
             "schema": SCHEMA,
-            "material": self.material.name,
+            "material": self.evaluation_set.name,
             "methods": {m.name: {"kind": m.kind, "regressor": m.regressor} for m in self.methods},
-            "images": {method.name: self._of_images(method) for method in self.methods},
-            "clips": {method.name: self._of_clips(method) for method in self.methods},
+            "images": {method.name: self._image_figures(method) for method in self.methods},
+            "clips": {method.name: self._clip_figures(method) for method in self.methods},
         }
 
-    def _of_images(self, method: Method) -> dict[str, Any]:
+    def _image_figures(self, method: Method) -> dict[str, Any]:
         outcomes = self.images[method.name]
         return {drive: image_figures(method, part) for drive, part in by_drive(outcomes).items()}
 
-    def _of_clips(self, method: Method) -> dict[str, Any]:
+    def _clip_figures(self, method: Method) -> dict[str, Any]:
         runs = self.clips[method.name]
         figures = {name: run.figures() for name, run in runs.items()}
         if not runs:
@@ -95,7 +93,7 @@ class Evaluation:
 
 
 def image_figures(method: Method, outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
-    """All figure groups of a method on single images. A further group is one more entry here."""
+    """Returns all figure groups of a method on single images. A new group is one more entry here."""
     figures: dict[str, Any] = {
         "boundaries": boundary_figures(outcomes),
         "lateral": lateral_figures(outcomes),
@@ -107,51 +105,52 @@ def image_figures(method: Method, outcomes: Sequence[FrameOutcome]) -> dict[str,
 
 
 def by_drive(outcomes: Sequence[FrameOutcome]) -> dict[str, list[FrameOutcome]]:
-    """The outcomes of each drive, and all of them together under `overall`."""
+    """Returns the outcomes of each drive, and all of them together as `overall`."""
     drives: dict[str, list[FrameOutcome]] = {}
     for outcome in outcomes:
         drives.setdefault(outcome.frame.group, []).append(outcome)
     return {**drives, OVERALL: list(outcomes)}
 
 
-def evaluate(methods: Sequence[Method], material: Material, tell: Callable[[str], None] = lambda _: None) -> Evaluation:
-    """Every method on every frame of `material`; `tell` hears what is being done.
+def run_evaluation(
+    methods: Sequence[Method], evaluation_set: EvaluationSet, report: Callable[[str], None] = lambda _: None
+) -> Evaluation:
+    """Runs every method on every frame of `evaluation_set`; `report` is called with the name of each stage.
 
-    Raises LabelError and SourceError for material that can't be read, or of which nothing is labelled.
+    Raises LabelError and SourceError if the frames can't be read, and LabelError if none is labeled.
     """
     images: dict[str, list[FrameOutcome]] = {method.name: [] for method in methods}
-    tell("single images")
-    for frame, image in material.images():
+    report("single images")
+    for frame, image in evaluation_set.images():
         for method in methods:
             images[method.name].append(method.detect(image, frame))
     clips: dict[str, dict[str, ClipRun]] = {method.name: {} for method in methods}
-    for clip in material.clips:
-        tell(clip.name)
-        for name, run in _follow(methods, clip).items():
+    for clip in evaluation_set.clips:
+        report(clip.name)
+        for name, run in _track(methods, clip).items():
             clips[name][clip.name] = run
-    if methods and not images[methods[0].name] and not material.clips:
-        raise LabelError(f"nothing is labelled in {material.name}", "give labelled images")
-    return Evaluation(material, tuple(methods), images, clips)
+    if methods and not images[methods[0].name] and not evaluation_set.clips:
+        raise LabelError(f"{evaluation_set.name} has no labeled frames", "give labeled images")
+    return Evaluation(evaluation_set, tuple(methods), images, clips)
 
 
-def _follow(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]:
-    wanted = read_clip_labels(clip.labels, clip.coverage)
+def _track(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]:
     runs = {method.name: ClipRun() for method in methods}
-    followers = {method.name: method.start_clip() for method in methods}
+    trackers = {method.name: method.start_clip() for method in methods}
     for index, image, timestamp in _decoded(clip.video, clip.frames):
         for method in methods:
             run = runs[method.name]
-            found = followers[method.name](image, timestamp)
+            found = trackers[method.name](image, timestamp)
             run.reported.append(found)
             run.size = (image.shape[1], image.shape[0])
-            if index in wanted:
-                run.tracked.append(FrameOutcome(wanted[index], found))
-                run.alone.append(method.detect(image, wanted[index]))
+            if index in clip.labelled:
+                run.tracked.append(FrameOutcome(clip.labelled[index], found))
+                run.alone.append(method.detect(image, clip.labelled[index]))
     return runs
 
 
 def _decoded(video: Path, frames: range) -> Iterator[tuple[int, Image, float]]:
-    """Frames of a clip with their index and their time in seconds."""
+    """Yields the frames of a clip with their index and their time in seconds."""
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
         raise SourceError(f"{video} can't be read as a video", "give the path of a video file")

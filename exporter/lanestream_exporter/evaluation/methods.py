@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Protocol
 
-from lanestream.detection import answered
+import numpy as np
+from numpy.typing import NDArray
+
 from lanestream.detection.candidate_detector import CandidateDetector
+from lanestream.detection.features import paint_gray
+from lanestream.detection.interface import FrameContext, ModelRole
+from lanestream.detection.patches import cut_patches
+from lanestream.detection.proposals import MOST_CANDIDATES
 from lanestream.engine import Engine
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabelledFrame, to_working
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
-from lanestream_exporter.evaluation.outcomes import MOST_CANDIDATES, FrameOutcome, judge
+from lanestream_exporter.evaluation.outcomes import MOST_RANKED, FrameOutcome, JudgedCandidates, judge
 
 # Takes the frames of a clip in order, each with its time in seconds, and returns the boundaries of each.
 ClipTracker = Callable[[Image, float], tuple[ReportedBoundary, ...]]
@@ -56,28 +61,29 @@ class ServedModel:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self.name = engine.network.name
-        self.kind = str(engine.network.metadata["kind"])
-        detector = engine.detector
-        self._wide: CandidateDetector | None = None
-        self.threshold: float | None = None
-        self.regressor: str | None = None
-        if isinstance(detector, CandidateDetector):
-            self._wide = replace(detector, search=replace(detector.search, limit=MOST_CANDIDATES))
-            self.threshold = detector.threshold
-            prior_estimator = engine.pipeline().glance
-            self.regressor = None if prior_estimator is None else prior_estimator.network.name
+        model = engine.main_model()
+        self.name = model.name
+        self.kind: str = model.info.kind
+        detector = engine.detectors[engine.select()]
+        self._candidates = detector if isinstance(detector, CandidateDetector) else None
+        self.threshold = None if self._candidates is None else self._candidates.threshold
+        has_prior = self._candidates is not None and self._candidates.regressor is not None
+        self.regressor = engine.models["regressor"].name if has_prior else None
 
     def detect(self, image: Image, frame: LabelledFrame) -> FrameOutcome:
         """Evaluates a single image as the first frame of a new session."""
-        session = self._engine.open_session()
-        prepared = answered(session.prepare(image))
-        outputs = self._engine.network.run(prepared.inputs)
-        reports = _reports(session.conclude(prepared, outputs, 0.0))
-        if self._wide is None:
-            return FrameOutcome(frame, reports)
-        wide = answered(replace(self._engine.pipeline(), detector=self._wide).prepare(image))
-        return FrameOutcome(frame, reports, judge(prepared, outputs, wide, frame))
+        reports = _reports(self._engine.process(self._engine.open_session(), image, 0.0))
+        candidates = None if self._candidates is None else self._judge(self._candidates, *to_working(frame, image))
+        return FrameOutcome(frame, reports, candidates)
+
+    def _judge(self, detector: CandidateDetector, frame: LabelledFrame, image: Image) -> JudgedCandidates:
+        """Judges the candidates of a working image: the same search as in `detect`, with more results."""
+        proposals = detector.propose(image, paint_gray(image), FrameContext(), self._infer, MOST_RANKED)
+        patches = cut_patches(image, proposals.curves, proposals.spans, proposals.view, detector.patch)
+        return judge(proposals, self._infer("classifier", patches[:MOST_CANDIDATES]), frame)
+
+    def _infer(self, role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return self._engine.models[role].run(inputs)
 
     def start_clip(self) -> ClipTracker:
         """Returns the tracker of a new session."""

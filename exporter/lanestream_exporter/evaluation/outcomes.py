@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Prepared
-from lanestream.detection.candidate_detector import TRUE_LANE, CandidateDetector
+from lanestream.detection.candidate_detector import BOUNDARY, CandidateDetector
+from lanestream.detection.proposals import Proposals
 from lanestream_exporter.datasets.labels import LabelledFrame
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_sides
-from lanestream_exporter.samples.patches import TruthRule, distance_along
+from lanestream_exporter.samples.patches import TruthRule
 
-MOST_CANDIDATES = 32
+# The most candidates whose ranks are evaluated; the classifier sees fewer in service.
+MOST_RANKED = 32
 
 RULES = {"far_40": TruthRule(far=40.0), "far_30": TruthRule(far=30.0)}
 
@@ -55,15 +56,19 @@ def ego_pair(outcome: FrameOutcome) -> FrameOutcome:
     return FrameOutcome(replace(outcome.frame, lanes=lanes), reports)
 
 
-def judge(prepared: Prepared, outputs: NDArray[np.float32], wide: Prepared, frame: LabelledFrame) -> JudgedCandidates:
-    """Judges the candidates that the classifier saw, and up to 32 candidates of `wide`, against the labels."""
-    verdicts = {name: rule.judge(prepared.candidates, frame, prepared.view) for name, rule in RULES.items()}
+def judge(proposals: Proposals, outputs: NDArray[np.float32], frame: LabelledFrame) -> JudgedCandidates:
+    """Judges up to 32 candidates against the labels of `frame`, all in pixels of the working image.
+
+    `outputs` (M, 2) are the classifier's for the first M, which are those that it sees in service.
+    """
+    seen = np.arange(len(outputs))
+    served = replace(proposals, curves=proposals.curves.take(seen), spans=proposals.spans.take(seen))
+    verdicts = {name: rule.judge(served.curves, served.spans, served.view, frame) for name, rule in RULES.items()}
     ego, rule = ego_sides(frame), RULES["far_40"]
     proposed = []
     for lane in frame.lanes:
-        measured = [distance_along(c, lane, wide.view) for c in wide.candidates[:MOST_CANDIDATES]]
-        true = [d * 1280.0 / frame.width <= rule.near and overlap >= rule.overlap for d, overlap in measured]
-        rank = true.index(True) if any(true) else None
+        true = rule.follows(proposals.curves, proposals.spans, proposals.view, lane, frame.width)
+        rank = int(true.argmax()) if true.any() else None
         proposed.append(LabelProposal(any(lane is side for side in ego), rank))
-    own, decided = outputs[:, TRUE_LANE].astype(np.float64), CandidateDetector.judged(prepared, outputs)
+    own, decided = outputs[:, BOUNDARY].astype(np.float64), CandidateDetector.probabilities(served, outputs)
     return JudgedCandidates(own, decided, verdicts, tuple(proposed))

@@ -24,7 +24,7 @@ from lanestream_exporter.evaluation.bootstrap import SPAN, STILLS
 from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.candidates import clear_candidates
 from lanestream_exporter.evaluation.figures import match_all
-from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, Material, by_drive
+from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, by_drive
 from lanestream_exporter.evaluation.outcomes import RULES, FrameOutcome
 
 CHART_RULE = "far_40"
@@ -50,7 +50,7 @@ def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any
         block={"stills": STILLS, "span": SPAN},
         charts=charts(evaluation, figures),
         gallery_method=first.name,
-        gallery=gallery(evaluation.material, evaluation.images[first.name]),
+        gallery=gallery(evaluation.evaluation_set, evaluation.images[first.name]),
     )
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "report.html"
@@ -166,7 +166,7 @@ class GalleryImage:
     url: str = field(repr=False)
 
 
-def gallery(dataset: Material, outcomes: Sequence[FrameOutcome]) -> list[GalleryImage]:
+def gallery(dataset: EvaluationSet, outcomes: Sequence[FrameOutcome]) -> list[GalleryImage]:
     """Draws the worst frames, worst first. Reads the images again, so that the evaluation need not keep them."""
     worst = sorted(range(len(outcomes)), key=lambda i: _badness(outcomes[i]), reverse=True)[:GALLERY_FRAMES]
     rank_of = {index: rank for rank, index in enumerate(worst)}

@@ -11,8 +11,8 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from lanestream.detection.patches import PatchGeometry
 from lanestream.errors import CheckpointError
+from lanestream.road.crops import PatchGeometry
 from lanestream_exporter.alexnet import FULL, AlexNet, Shape, load_state
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.exportable import ExportableNetwork
@@ -60,8 +60,8 @@ def read_network(path: Path, foreign: ForeignNetwork | None = None) -> tuple[Exp
 def _read_own(path: Path, state: Mapping[str, Any]) -> ExportableNetwork:
     weights = state["network"]
     shape = _recorded_shape(path, state)
-    if "shape.0.weight" in weights:
-        regressor = LaneRegressor(shape, normalised=_has_norms(weights))
+    if "column_head.0.weight" in weights:
+        regressor = LaneRegressor(shape, batch_norm=_has_norms(weights))
         _load_weights(path, regressor, weights)
         return ExportableRegressor(regressor.eval().folded())
     return ExportableClassifier(_load_alexnet(path, weights, shape), patch_geometry=PatchGeometry(shape.size))
@@ -107,7 +107,7 @@ def _load_alexnet(path: Path, weights: Mapping[str, Tensor], shape: Shape) -> Al
         raise CheckpointError(
             f"{path} has {len(last)} classes, but the service needs two", "fine-tune it with a final layer of 2"
         )
-    network = AlexNet(shape=shape, normalised=_has_norms(weights))
+    network = AlexNet(shape=shape, batch_norm=_has_norms(weights))
     _load_weights(path, network, weights)
     return network.eval().folded()
 

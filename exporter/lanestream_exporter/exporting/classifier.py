@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -13,25 +14,27 @@ from sklearn.metrics import average_precision_score
 from torch import Tensor, nn
 
 from lanestream import __version__
-from lanestream.detection import Prepared, answered
-from lanestream.detection.candidate_detector import TRUE_LANE, CandidateDetector
-from lanestream.detection.ego_prior import EgoPriorEstimator
-from lanestream.detection.patches import PatchCutter, PatchGeometry
+from lanestream.detection.candidate_detector import BOUNDARY, CandidateDetector
+from lanestream.detection.interface import FrameContext, Infer, ModelRole
 from lanestream.images.decoding import ImageLimits, decode
-from lanestream.inference import ClassifierInfo, PatchInfo
+from lanestream.inference.model_info import ClassifierInfo
+from lanestream.road.crops import PatchGeometry
 from lanestream.road.view import Image
 from lanestream_exporter.alexnet import FULL, AlexNet
+from lanestream_exporter.datasets.labels import to_working
 from lanestream_exporter.exporting.compression import in_batches, truncate_layers
 from lanestream_exporter.exporting.exportable import (
     Calibration,
     ExportDescription,
     MetricValues,
+    RunNetwork,
     ValidationSet,
     fit_calibration,
 )
-from lanestream_exporter.exporting.frames import ExportFrames, LabeledJpeg, Part
+from lanestream_exporter.exporting.frames import ExportFrames, Part
 from lanestream_exporter.exporting.graph import NORMALIZATIONS, exporter_versions
-from lanestream_exporter.samples.patches import FALSE, TRUE, TruthRule
+from lanestream_exporter.samples.patches import FALSE, TRUE, PatchMaker
+from lanestream_exporter.samples.prior_regressor import PriorRegressor, no_regressor
 
 _MAX_TRAINING_INPUTS: Final = 1024
 
@@ -56,7 +59,7 @@ class ServedClassifier(nn.Module):
 class ExportableClassifier:
     """A plain AlexNet with two `classes`, the lane second, and the geometry and normalization of its patches.
 
-    It is calibrated and verified on candidates that are proposed with the ego-lane prior of `prior_estimator`, if set.
+    It is calibrated and verified on candidates that are proposed with the ego-lane prior of `prior`, if set.
     """
 
     network: AlexNet
@@ -64,7 +67,7 @@ class ExportableClassifier:
     patch_geometry: PatchGeometry = PatchGeometry(FULL.size)
     normalization: str = "contrast"
     calibration: Calibration = Calibration()
-    prior_estimator: EgoPriorEstimator | None = None
+    prior: PriorRegressor | None = None
 
     default_name = "lanestream-alexnet"
     input_name = "patches"
@@ -76,20 +79,33 @@ class ExportableClassifier:
     @property
     def detector(self) -> CandidateDetector:
         """Returns the detector that will run the file."""
-        return CandidateDetector(self.calibration.threshold, cutter=PatchCutter(self.patch_geometry))
+        regressor = None if self.prior is None else self.prior.regressor
+        return CandidateDetector(self.calibration.threshold, self.patch_geometry, regressor)
+
+    def infer(self, run: RunNetwork) -> Infer:
+        """Returns what the detector calls for outputs: `run` for the classifier's, the prior's model for its own."""
+        prior = no_regressor if self.prior is None else self.prior.infer
+
+        def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+            return run(inputs) if role == "classifier" else prior(role, inputs)
+
+        return infer
 
     def training_inputs(self, frames: ExportFrames) -> NDArray[np.uint8]:
         """Returns patches (N, size, size, 3) of candidates of training frames. Raises LabelError."""
-        patches = np.concatenate([prepared.inputs for prepared, _ in self._prepared(frames, "train")])
+        patches = np.concatenate([patches for _, patches, _ in self._candidates(frames, "train")])
         chosen = np.random.default_rng(0).permutation(len(patches))[:_MAX_TRAINING_INPUTS]
         return np.asarray(patches[chosen])
 
     def validation_set(self, frames: ExportFrames) -> ValidationSet:
         """Returns all candidates of validation frames, labeled by the same rule as in training. Raises LabelError."""
-        pairs = self._prepared(frames, "val")
-        verdicts = [TruthRule().judge(prepared.candidates, frame.labels, prepared.view) for prepared, frame in pairs]
+        images, patches, verdicts = zip(*self._candidates(frames, "val"), strict=True)
         return ValidationSet(
-            len(pairs), tuple(prepared for prepared, _ in pairs), {"verdict": np.concatenate(verdicts)}
+            frames=len(images),
+            images=images,
+            contexts=(FrameContext(),) * len(images),
+            inputs=np.concatenate(patches),
+            truth={"verdict": np.concatenate(verdicts)},
         )
 
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> ExportableClassifier:
@@ -115,10 +131,10 @@ class ExportableClassifier:
         """Returns the module to export; `half`: its network in float16."""
         return ServedClassifier(self.network, self.normalization, self.calibration, half).eval()
 
-    def metrics(self, outputs: NDArray[np.float32], validation: ValidationSet) -> MetricValues:
+    def metrics(self, run: RunNetwork, validation: ValidationSet) -> MetricValues:
         """Returns accuracy and average precision on the clearly true or false candidates."""
         clear, labels = _clear_candidates(validation)
-        probability = outputs[clear, TRUE_LANE]
+        probability = run(validation.inputs[clear])[:, BOUNDARY]
         accuracy = float(((probability >= self.calibration.threshold) == (labels == 1)).mean())
         both = len(np.unique(labels)) == 2
         precision = float(average_precision_score(labels, probability)) if both else float("nan")
@@ -126,18 +142,12 @@ class ExportableClassifier:
 
     def info(self, description: ExportDescription) -> ClassifierInfo:
         """Returns the metadata of the file."""
-        geometry = self.patch_geometry
         return ClassifierInfo(
             kind="classifier",
             name=description.name,
             version=__version__,
             classes=self.classes,
-            strip=PatchInfo(
-                size=geometry.size,
-                half_width=geometry.half_width,
-                min_half_width=geometry.min_half_width,
-                lean=geometry.lean,
-            ),
+            patch=self.patch_geometry,
             temperature=self.calibration.temperature,
             threshold=self.calibration.threshold,
             precision=description.precision,
@@ -146,12 +156,14 @@ class ExportableClassifier:
             exporter=exporter_versions(),
         )
 
-    def _prepared(self, frames: ExportFrames, part: Part) -> list[tuple[Prepared, LabeledJpeg]]:
-        return [(self._prepare(decode(frame.jpeg, ImageLimits())), frame) for frame in frames.jpegs(part)]
-
-    def _prepare(self, image: Image) -> Prepared:
-        prior = None if self.prior_estimator is None else answered(self.prior_estimator.look(image))
-        return replace(self.detector.prepare(image, prior=prior), prior=prior)
+    def _candidates(
+        self, frames: ExportFrames, part: Part
+    ) -> Iterator[tuple[Image, NDArray[np.uint8], NDArray[np.int64]]]:
+        """Yields the working images of `part`, each with the patches of its candidates and the verdicts on them."""
+        maker = PatchMaker(self.patch_geometry, self.prior)
+        for frame in frames.jpegs(part):
+            labels, image = to_working(frame.labels, decode(frame.jpeg, ImageLimits()))
+            yield image, *maker.proposed(image, labels, maker.propose(image))
 
 
 def _clear_candidates(validation: ValidationSet) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

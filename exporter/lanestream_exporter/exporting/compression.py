@@ -54,6 +54,11 @@ def in_batches(function: Callable[[Tensor], Tensor], inputs: NDArray[np.uint8]) 
     return torch.cat([function(batch) for batch in batches])
 
 
+def run_in_pytorch(module: nn.Module) -> Callable[[NDArray[np.uint8]], NDArray[np.float32]]:
+    """Returns a function that runs `module` on RGB inputs (N, H, W, 3) uint8."""
+    return lambda inputs: np.asarray(in_batches(module, inputs).numpy(), dtype=np.float32)
+
+
 def _factorized(layer: nn.Linear, outputs: Tensor, energy: float) -> nn.Module:
     """Returns two layers that reproduce `outputs` (N, out) of `layer` in their strongest principal components.
 

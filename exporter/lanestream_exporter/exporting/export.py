@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.errors import ExportError
-from lanestream.inference import OnnxModel
-from lanestream_exporter.exporting.compression import in_batches, quantize
+from lanestream.inference.onnx_model import load
+from lanestream_exporter.exporting.compression import quantize, run_in_pytorch
 from lanestream_exporter.exporting.exportable import ExportableNetwork, ExportDescription, Precision, ValidationSet
 from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import describe, publish, write_graph
@@ -154,26 +154,28 @@ def _measure(
     files: dict[Precision, Path],
     precision: Precision,
 ) -> ExportReport:
-    expected = in_batches(network.serving_module(), validation.inputs).numpy()
+    reference = run_in_pytorch(network.serving_module())
+    expected = reference(validation.inputs)
     # The uncompressed checkpoint gets the same temperature and threshold, which belong to the file.
-    checkpoint = original.with_calibration(network.calibration).serving_module()
-    checkpoint_metrics = network.metrics(in_batches(checkpoint, validation.inputs).numpy(), validation)
+    checkpoint = run_in_pytorch(original.with_calibration(network.calibration).serving_module())
     times = time_files({str(name): path for name, path in files.items()}, validation.inputs)
-    outputs: dict[Precision, NDArray[np.float32]] = {}
+    models = {name: load(path) for name, path in files.items()}
     measured: dict[Precision, ModelMeasurement] = {}
-    for name, path in files.items():
-        outputs[name], mean, largest = differences(OnnxModel.load(path, "cpu"), validation, expected)
-        metrics = network.metrics(outputs[name], validation)
-        size, milliseconds = path.stat().st_size, times.milliseconds[name]
+    for name, model in models.items():
+        mean, largest = differences(model, validation, expected)
+        metrics = network.metrics(model.run, validation)
+        size, milliseconds = files[name].stat().st_size, times.milliseconds[name]
         measured[name] = ModelMeasurement(name, metrics, mean, largest, size, milliseconds)
     return ExportReport(
         network,
         validation.frames,
         len(validation.inputs),
-        ModelMeasurement("checkpoint", checkpoint_metrics),
+        ModelMeasurement("checkpoint", network.metrics(checkpoint, validation)),
         measured["fp32"],
         measured[precision],
-        compare_boundaries(network.detector, validation, expected, outputs[precision]),
+        compare_boundaries(
+            network.detector, validation, network.infer(reference), network.infer(models[precision].run)
+        ),
         times.provider,
     )
 

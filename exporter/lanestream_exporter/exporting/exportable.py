@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
@@ -13,12 +12,16 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax, softmax
 from torch import nn
 
-from lanestream.detection import Detector, Prepared
-from lanestream.inference import ModelInfo
+from lanestream.detection.interface import Detector, FrameContext, Infer
+from lanestream.inference.model_info import ModelInfo
+from lanestream.road.view import Image
 from lanestream_exporter.exporting.frames import ExportFrames
 
 Precision = Literal["fp32", "fp16", "int8"]
 MetricValues = dict[str, float]
+
+# Returns the outputs (N, outputs) of a network, in PyTorch or from a file, for its inputs (N, H, W, 3) uint8 RGB.
+RunNetwork = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -31,24 +34,18 @@ class Calibration:
 
 @dataclass(frozen=True)
 class ValidationSet:
-    """Validation frames, decoded from JPEG and prepared by the detector, with the ground truth of their inputs.
+    """Validation frames, decoded from JPEG, with the ground truth of what is measured on them.
 
-    `frames` is the number of frames; a frame may be prepared more than once, in different ways. Each array of `truth`
-    has one entry per row of `inputs` or per item of `prepared`, whichever the network's metrics need.
+    A detector gets each of the `images` (BGR) with its context, and the network gets `inputs` (N, H, W, 3) for them.
+    `frames` is the number of frames; one may be in `images` more than once, in different contexts. Each array of
+    `truth` has one entry per image or per input, whichever the network's metrics need.
     """
 
     frames: int
-    prepared: tuple[Prepared, ...]
+    images: tuple[Image, ...]
+    contexts: tuple[FrameContext, ...]
+    inputs: NDArray[np.uint8]
     truth: dict[str, NDArray[Any]]
-
-    @cached_property
-    def inputs(self) -> NDArray[np.uint8]:
-        """Returns the network inputs (N, H, W, 3) of all frames."""
-        return np.concatenate([prepared.inputs for prepared in self.prepared])
-
-    def split_by_frame(self, outputs: NDArray[np.float32]) -> Sequence[NDArray[np.float32]]:
-        """Splits the network outputs (N, ...) for `inputs` into one array per prepared frame."""
-        return np.split(outputs, np.cumsum([len(prepared.inputs) for prepared in self.prepared])[:-1])
 
 
 @dataclass(frozen=True)
@@ -96,11 +93,14 @@ class ExportableNetwork(Protocol):
     def detector(self) -> Detector:
         """Returns the detector that will run the file."""
 
+    def infer(self, run: RunNetwork) -> Infer:
+        """Returns what the detector calls for outputs: `run` for those of this network."""
+
     def training_inputs(self, frames: ExportFrames) -> NDArray[np.uint8]:
         """Returns inputs (N, H, W, 3) of training frames, for ranks and int8 ranges. Raises LabelError."""
 
     def validation_set(self, frames: ExportFrames) -> ValidationSet:
-        """Returns validation frames, decoded from JPEG and prepared by the detector. Raises LabelError."""
+        """Returns validation frames with the inputs that the detector makes of them. Raises LabelError."""
 
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> Self:
         """Returns the network with truncated hidden layers."""
@@ -114,8 +114,8 @@ class ExportableNetwork(Protocol):
     def serving_module(self, half: bool = False) -> nn.Module:
         """Returns the module to export: uint8 inputs (N, H, W, 3) to served outputs; `half`: network in float16."""
 
-    def metrics(self, outputs: NDArray[np.float32], validation: ValidationSet) -> MetricValues:
-        """Returns the metrics of `outputs` for the inputs of `validation`."""
+    def metrics(self, run: RunNetwork, validation: ValidationSet) -> MetricValues:
+        """Returns the metrics of the network that `run` runs on `validation`."""
 
     def info(self, description: ExportDescription) -> ModelInfo:
         """Returns the metadata of the file."""

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, Literal, TypeVar
 
 import cv2
 import numpy as np
 
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.splits import real_frames
+from lanestream_exporter.datasets.labels import LabelledFrame, LabelledImages
+from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.samples.road_frames import RoadFrame, road_frames
 from lanestream_exporter.scenes import render_still, sample_scene
-from lanestream_exporter.training.config import PatchData
-from lanestream_exporter.training.ownframes import own_frames
 
 # An export never uses test frames.
 Part = Literal["train", "val"]
@@ -39,22 +36,21 @@ class LabeledJpeg:
 
 @dataclass(frozen=True)
 class ExportFrames:
-    """Rendered frames, `rendered` per part, and labeled real frames: those of `own`, or the project's under `root`.
+    """Rendered frames, `rendered` per part, and labeled real frames of `datasets`, if given.
 
     At most `real` real frames per part are used, evenly spaced among all.
     """
 
-    root: Path | None
+    datasets: DatasetCollection | None
     rendered: int = 48
     real: int = 96
-    own: PatchData | None = None
 
     @property
     def origin(self) -> str:
         """Returns a description of where the frames come from."""
-        if self.own is not None:
-            return f"rendered scenes and real frames of {', '.join(frames.path for frames in self.own.train)}"
-        return "rendered scenes" if self.root is None else "rendered scenes and the project's real frames"
+        if self.datasets is None:
+            return "rendered scenes"
+        return f"rendered scenes and real frames of {', '.join(credit['name'] for credit in self.datasets.credits())}"
 
     def jpegs(self, part: Part) -> list[LabeledJpeg]:
         """Returns full frames of `part` as JPEG files. Raises LabelError for unreadable real frames."""
@@ -68,10 +64,8 @@ class ExportFrames:
         real = _evenly_spaced(road_frames(self._real(part)), self.real)
         return [*real, *(frame for frame in rendered if frame is not None)]
 
-    def _real(self, part: Part) -> Iterator[tuple[LabelledFrame, Image]]:
-        if self.own is not None:
-            return own_frames(self.own)[0 if part == "train" else 1]
-        return iter(()) if self.root is None else real_frames(self.root, part)
+    def _real(self, part: Part) -> LabelledImages:
+        return iter(()) if self.datasets is None else self.datasets.frames(part)
 
     def _rendered(self, part: Part) -> Iterator[tuple[LabelledFrame, Image, float]]:
         for index in range(self.rendered):

@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 from lanestream import __version__
 from lanestream.errors import ExportError
-from lanestream.inference import ModelInfo
-from lanestream.inference.model_info import METADATA_KEY
+from lanestream.inference.model_info import METADATA_KEY, ModelInfo
 from lanestream_exporter.alexnet import LEAST_CONTRAST
 
 # Means and standard deviations of ImageNet's red, green and blue, from 0 to 1, as torchvision uses them.

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from lanestream.runtime import RuntimeOptions
 from numpy.typing import NDArray
 
-from lanestream.detection import Detector
-from lanestream.inference import OnnxModel, load_model
-from lanestream.inference.providers import offered, without_gpus
+from lanestream.detection.interface import Detector, Infer
+from lanestream.inference.loaded_model import LoadedModel
+from lanestream.inference.loading import load_model
+from lanestream.inference.providers import AUTO, Installed, RuntimeOptions
 from lanestream.road.results import Detection
+from lanestream.road.view import WORKING_WIDTH
 from lanestream_exporter.exporting.exportable import MetricValues, ValidationSet
 
 BATCH_SIZES: Final = (1, 4, 16)
@@ -27,7 +28,6 @@ _ROUNDS: Final = 15
 
 # Detections farther apart than this, in pixels of a 640 pixel wide image, are different boundaries.
 _MAX_MATCH_DISTANCE: Final = 15.0
-_REFERENCE_WIDTH: Final = 640.0
 
 
 @dataclass(frozen=True)
@@ -59,40 +59,34 @@ class BoundaryComparison:
     largest: float
 
 
-def run_in_batches(model: OnnxModel, inputs: NDArray[np.uint8], batch: int = BATCH_SIZES[-1]) -> NDArray[np.float32]:
+def run_in_batches(model: LoadedModel, inputs: NDArray[np.uint8], batch: int = BATCH_SIZES[-1]) -> NDArray[np.float32]:
     """Runs `model` on `inputs` with the given batch size and returns its outputs (N, outputs)."""
     return np.concatenate([model.run(inputs[i : i + batch]) for i in range(0, len(inputs), batch)])
 
 
-def differences(
-    model: OnnxModel, validation: ValidationSet, expected: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], float, float]:
-    """Returns the model's outputs (N, outputs), and their mean and largest difference from `expected`.
+def differences(model: LoadedModel, validation: ValidationSet, expected: NDArray[np.float32]) -> tuple[float, float]:
+    """Returns the mean and the largest difference of the model's outputs from `expected` (N, outputs).
 
     The largest difference is over all batch sizes.
     """
     inputs = validation.inputs
-    outputs = run_in_batches(model, inputs)
     subset = np.unique(np.linspace(0, len(inputs) - 1, min(_SUBSET, len(inputs))).astype(int))
     smaller = [np.abs(run_in_batches(model, inputs[subset], batch) - expected[subset]) for batch in BATCH_SIZES[:-1]]
-    difference = np.abs(outputs - expected)
-    return outputs, float(difference.mean()), float(max(part.max() for part in (difference, *smaller)))
+    difference = np.abs(run_in_batches(model, inputs) - expected)
+    return float(difference.mean()), float(max(part.max() for part in (difference, *smaller)))
 
 
 def compare_boundaries(
-    detector: Detector, validation: ValidationSet, expected: NDArray[np.float32], outputs: NDArray[np.float32]
+    detector: Detector, validation: ValidationSet, first: Infer, second: Infer
 ) -> BoundaryComparison:
-    """Compares the boundaries that `detector` finds with two networks' outputs for the validation frames."""
+    """Compares the boundaries that `detector` finds on the validation frames with two networks' outputs."""
     distances: list[NDArray[np.float64]] = []
     unmatched = 0
-    frames = zip(
-        validation.prepared, validation.split_by_frame(expected), validation.split_by_frame(outputs), strict=True
-    )
-    for prepared, *parts in frames:
-        first, second = (detector.finish(prepared, part).detections for part in parts)
-        matched = _match(first, second, _REFERENCE_WIDTH / prepared.view.width)
+    for image, context in zip(validation.images, validation.contexts, strict=True):
+        ours, theirs = (detector.detect(image, context, infer).boundaries for infer in (first, second))
+        matched = _match(ours, theirs, WORKING_WIDTH / image.shape[1])
         distances += matched
-        unmatched += len(first) + len(second) - 2 * len(matched)
+        unmatched += len(ours) + len(theirs) - 2 * len(matched)
     values = np.concatenate(distances) if distances else np.zeros(1)
     return BoundaryComparison(len(distances), unmatched, float(values.mean()), float(values.max()))
 
@@ -128,13 +122,13 @@ def time_files(paths: Mapping[str, Path], inputs: NDArray[np.uint8]) -> Inferenc
     Other load on the machine slows all files equally, so that their ratio holds even if the times do not.
     """
     batch = np.resize(inputs[: BATCH_SIZES[-1]], (BATCH_SIZES[-1], *inputs.shape[1:]))
-    options, providers = RuntimeOptions(threads=1), without_gpus(offered())
-    models = {name: load_model(path, "auto", options, providers) for name, path in paths.items()}
+    options, installed = RuntimeOptions(threads=1), Installed.here().without_gpus()
+    models = {name: load_model(path, AUTO, options, installed) for name, path in paths.items()}
     times: dict[str, list[float]] = {name: [] for name in models}
     for _ in range(_WARMUP_ROUNDS + _ROUNDS):
         for name, model in models.items():
             started = time.perf_counter()
             model.run(batch)
             times[name].append(1e3 * (time.perf_counter() - started) / len(batch))
-    provider = next(iter(models.values())).provider
+    provider = next(iter(models.values())).placement.provider
     return InferenceTimes(provider, {name: float(np.median(t[_WARMUP_ROUNDS:])) for name, t in times.items()})

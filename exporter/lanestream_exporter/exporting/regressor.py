@@ -1,4 +1,4 @@
-"""Export of the regressor: road crops in, the layout that `detection.regression_detector.RegressorOutput` reads out."""
+"""Export of the regressor: road crops in, the layout of `detection.ego_prior.RegressorOutput` out."""
 
 from __future__ import annotations
 
@@ -14,22 +14,26 @@ from scipy.special import logit
 from torch import Tensor, nn
 
 from lanestream import __version__
-from lanestream.detection.regression_detector import RegressionDetector, RoadCropGeometry
+from lanestream.detection.ego_prior import RoadRegressor
+from lanestream.detection.interface import FrameContext, Infer, ModelRole
+from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.images.decoding import ImageLimits, decode
-from lanestream.inference import RegressorInfo, RoadCropInfo
+from lanestream.inference.model_info import RegressorInfo
+from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.exporting.compression import in_batches, truncate_layers
+from lanestream_exporter.exporting.compression import in_batches, run_in_pytorch, truncate_layers
 from lanestream_exporter.exporting.exportable import (
     Calibration,
     ExportDescription,
     MetricValues,
+    RunNetwork,
     ValidationSet,
     fit_calibration,
 )
 from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import contrast, exporter_versions
-from lanestream_exporter.regressor import Answer, LaneRegressor
-from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction
+from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, warped_road_crop
 from lanestream_exporter.samples.road_frames import RoadFrame
 
 _MAX_TRAINING_INPUTS: Final = 1024
@@ -54,8 +58,8 @@ class ServedRegressor(nn.Module):
 
     def forward(self, road_crops: Tensor) -> Tensor:
         """Returns the served outputs; only the network itself may run in half precision."""
-        answer = Answer.of(self.network(contrast(road_crops).to(self.dtype)).float())
-        return replace(answer, presence=answer.presence / self.temperature).told()
+        raw = RegressorPrediction.of(self.network(contrast(road_crops).to(self.dtype)).float())
+        return replace(raw, presence=raw.presence / self.temperature).served()
 
 
 @dataclass(frozen=True)
@@ -69,36 +73,57 @@ class ExportableRegressor:
     input_name = "road_crops"
     output_name = "readings"
     # These layers have few weights and take little time, but every output depends on them to a thousandth of the width.
-    fp32_layers = ("network.features.0.", "network.hidden.", "network.shape.", "network.doubts.")
+    fp32_layers = ("network.features.0.", "network.hidden.", "network.column_head.", "network.auxiliary_head.")
     default_rank_energy = 0.99996
     guarded_metrics = ("accuracy", "presence_accuracy")
 
     @property
     def detector(self) -> RegressionDetector:
         """Returns the detector that will run the file."""
-        return RegressionDetector(self.calibration.threshold, RoadCropGeometry(self.network.size.size))
+        return RegressionDetector(RoadRegressor(self.calibration.threshold, self._geometry))
+
+    @property
+    def _geometry(self) -> RoadCropGeometry:
+        return RoadCropGeometry(self.network.size.size)
+
+    def infer(self, run: RunNetwork) -> Infer:
+        """Returns what the detector calls for outputs: `run`."""
+        return lambda _, inputs: run(inputs)
 
     def training_inputs(self, frames: ExportFrames) -> NDArray[np.uint8]:
         """Returns road crops (N, size, size, 3) of training frames, as they are and warped to other cameras."""
         rng = np.random.default_rng(0)
-        geometry = self.detector.geometry
         road_frames = frames.road_frames("train")
-        crops = [sample(frame, geometry, warp)[0] for frame in road_frames for warp in _warps(frame, rng)]
+        crops = [
+            warped_road_crop(frame, self._geometry, warp)[0] for frame in road_frames for warp in _warps(frame, rng)
+        ]
         return np.stack([crops[i] for i in rng.permutation(len(crops))[:_MAX_TRAINING_INPUTS]])
 
     def validation_set(self, frames: ExportFrames) -> ValidationSet:
-        """Returns validation frames, each prepared with a known and with an unknown horizon. Raises LabelError."""
-        prepared, targets = [], []
+        """Returns validation frames, each with a known and with an unknown horizon. Raises LabelError.
+
+        They have the detail width, to which the regressor reduces a working image.
+        """
+        run = run_in_pytorch(self.serving_module())
+        inputs: list[NDArray[np.uint8]] = []
+
+        def record(_: ModelRole, crops: NDArray[np.uint8]) -> NDArray[np.float32]:
+            inputs.append(crops)
+            return run(crops)
+
+        images, contexts, targets = [], [], []
         road_frames = frames.road_frames("val")
         for frame in road_frames:
             image = decode(frame.jpeg, ImageLimits())
-            target = sample(frame, self.detector.geometry, plain_warp(frame, known=True))[1]
+            target = warped_road_crop(frame, self._geometry, plain_warp(frame, known=True))[1]
             for horizon in (frame.horizon, None):
-                prepared.append(self.detector.prepare(image, horizon))
+                images.append(image)
+                contexts.append(FrameContext(horizon))
                 targets.append((target.columns, target.known, target.presence, frame.horizon))
+                self.detector.regressor.predict(image, horizon, record)
         names = ("columns", "known", "presence", "horizon")
         truth = {name: np.array(values) for name, values in zip(names, zip(*targets, strict=True), strict=True)}
-        return ValidationSet(len(road_frames), tuple(prepared), truth)
+        return ValidationSet(len(road_frames), tuple(images), tuple(contexts), np.concatenate(inputs), truth)
 
     def compressed(self, energy: float, inputs: NDArray[np.uint8]) -> ExportableRegressor:
         """Returns the network with a truncated hidden layer."""
@@ -110,7 +135,7 @@ class ExportableRegressor:
     def calibrated(self, validation: ValidationSet) -> ExportableRegressor:
         """Returns the network with temperature and threshold of presence fitted where the labels define presence."""
         uncalibrated = self.with_calibration(Calibration()).serving_module()
-        presence = self._read(in_batches(uncalibrated, validation.inputs).numpy(), validation)[1]
+        presence = self._read(run_in_pytorch(uncalibrated), validation)[1]
         truth = validation.truth["presence"]
         logits = logit(np.clip(presence[truth >= 0.0], 1e-6, 1.0 - 1e-6))
         pairs = np.stack([np.zeros_like(logits), logits], axis=1).astype(np.float32)
@@ -124,9 +149,9 @@ class ExportableRegressor:
         """Returns the module to export; `half`: its network in float16."""
         return ServedRegressor(self.network, self.calibration.temperature, half).eval()
 
-    def metrics(self, outputs: NDArray[np.float32], validation: ValidationSet) -> MetricValues:
+    def metrics(self, run: RunNetwork, validation: ValidationSet) -> MetricValues:
         """Returns the shares of right columns and presences, and mean lateral errors in pixels at 640 wide."""
-        columns, presence = self._read(outputs, validation)
+        columns, presence = self._read(run, validation)
         error = _REFERENCE_WIDTH * np.abs(columns - validation.truth["columns"])
         labeled = validation.truth["known"] >= 1.0
         true_presence = validation.truth["presence"]
@@ -141,17 +166,11 @@ class ExportableRegressor:
 
     def info(self, description: ExportDescription) -> RegressorInfo:
         """Returns the metadata of the file."""
-        detector = self.detector
         return RegressorInfo(
             kind="regressor",
             name=description.name,
             version=__version__,
-            canvas=RoadCropInfo(
-                size=detector.geometry.size,
-                above=detector.geometry.above,
-                narrowest=detector.geometry.narrowest,
-                detail_width=detector.detail_width,
-            ),
+            road_crop=self._geometry,
             threshold=self.calibration.threshold,
             precision=description.precision,
             training={**description.training, "presence_temperature": round(self.calibration.temperature, 4)},
@@ -159,19 +178,18 @@ class ExportableRegressor:
             exporter=exporter_versions(),
         )
 
-    def _read(self, outputs: NDArray[np.float32], validation: ValidationSet) -> tuple[FloatArray, FloatArray]:
-        """Returns what the detector reads from outputs for P prepared frames.
+    def _read(self, run: RunNetwork, validation: ValidationSet) -> tuple[FloatArray, FloatArray]:
+        """Returns what the detector reads from the outputs of `run` for P validation images.
 
         Columns (P, 2, S) at `SHARES` of the true row offset, in image widths from the center; presence (P, 2).
         """
         columns, presence = [], []
-        parts = validation.split_by_frame(outputs)
-        for prepared, part, horizon in zip(validation.prepared, parts, validation.truth["horizon"], strict=True):
-            reading, view = self.detector.read(prepared, part)
+        frames = zip(validation.images, validation.contexts, validation.truth["horizon"], strict=True)
+        for image, context, horizon in frames:
+            output, view = self.detector.regressor.predict(image, context.horizon, self.infer(run))
             rows = horizon + np.array(SHARES) * (view.bottom - horizon)
-            x = np.stack([reading.curve(side, view).x(rows) for side in (0, 1)])
-            columns.append((x - (view.width - 1) / 2.0) / view.width)
-            presence.append(reading.presence)
+            columns.append((output.curves(view).x(rows) - view.middle) / view.width)
+            presence.append(output.presence)
         return np.array(columns), np.array(presence)
 
 
@@ -179,7 +197,7 @@ def _warps(frame: RoadFrame, rng: np.random.Generator) -> Iterator[Warp]:
     yield plain_warp(frame, known=True)
     yield plain_warp(frame, known=False)
     for _ in range(_WARPS_PER_FRAME):
-        yield Warp.drawn(rng)
+        yield Warp.random(rng)
 
 
 def _mean(values: NDArray[np.bool_] | NDArray[np.float64]) -> float:

@@ -1,1 +1,1 @@
-"""Training samples: patches, road crops, their augmentation and the cache they are kept in."""
+"""Training samples: patches, road crops, their augmentation, and the files they are cached in."""

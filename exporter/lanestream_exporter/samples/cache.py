@@ -1,4 +1,4 @@
-"""Files of rendered scenes, made by several processes, once, and kept in a folder."""
+"""Cached files of rendered scenes, written once by several processes."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ import cv2
 
 SCENES_PER_FILE = 250
 
-# Of what is rendered and how it is labelled; part of the files' names, so that those of another edition are not used.
-EDITION = 3
+# The version of rendering and labeling. It is part of the file names, so that files of another version are not used.
+RENDERING_VERSION = 3
 
-# Writes the file with that number, of so many scenes, to that path.
-Write = Callable[[int, int, Path], object]
+# Called with a file's number, its number of scenes and its path; writes the file.
+WriteScenes = Callable[[int, int, Path], object]
 
 
-def files_of(scenes: int) -> list[int]:
-    """How `scenes` scenes are shared out among files."""
+def scenes_per_file(scenes: int) -> list[int]:
+    """Returns the number of scenes per file for `scenes` scenes in all."""
     full, rest = divmod(scenes, SCENES_PER_FILE)
     return [SCENES_PER_FILE] * full + ([rest] if rest else [])
 
 
 def scene_files(
-    folder: Path, kind: str, scenes: Sequence[int], write: Write, workers: int, done: Callable[[int], None]
+    folder: Path, kind: str, scenes: Sequence[int], write: WriteScenes, workers: int, done: Callable[[int], None]
 ) -> list[Path]:
-    """Files named by their `kind` and edition, the n-th of `scenes[n]` scenes, made by `write` where they are missing.
+    """Returns files named by `kind` and rendering version, the n-th with `scenes[n]` scenes; writes missing ones.
 
-    `write` is a module's function, because other processes call it. `done` is called with the number of scenes of each
-    file as it is finished.
+    `write` must be a module-level function, because other processes call it. `done` is called with the number of scenes
+    of each file when it is finished.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{kind}-{EDITION}-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
+    paths = [folder / f"{kind}-{RENDERING_VERSION}-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
     missing = [number for number, path in enumerate(paths) if not path.exists()]
     done(sum(scenes) - sum(scenes[number] for number in missing))
-    # Spawned, because a forked OpenCV or torch may wait for threads that the fork left behind.
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
+    # Spawned, because a forked OpenCV or torch may wait for threads that do not exist after a fork.
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_worker)
     try:
         running = {pool.submit(write, number, scenes[number], paths[number]): number for number in missing}
         for future in as_completed(running):
@@ -49,7 +49,7 @@ def scene_files(
     return paths
 
 
-def _begin() -> None:
-    """Leaves interrupts to the parent, and the other processors to the other processes."""
+def _start_worker() -> None:
+    """Leaves interrupts to the parent process and uses one thread, because there is one process per CPU."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)

@@ -1,84 +1,141 @@
-"""Patches of rendered scenes and of real frames, made once and kept in a folder."""
+"""Patch files: patches of rendered scenes and of labeled frames, made once and kept as JPEG bytes with their labels."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.ego_prior import EgoPriorEstimator
-from lanestream.detection.patches import PatchCutter, PatchGeometry
-from lanestream.detection.proposals import CandidateSearch
-from lanestream.road.view import Image, RoadView
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream.detection.proposals import MOST_CANDIDATES
+from lanestream.errors import LabelError
+from lanestream.road.crops import PatchGeometry
+from lanestream.road.view import RoadView, Scaling
+from lanestream_exporter.datasets.labels import LabelledImages, to_working
 from lanestream_exporter.samples.cache import scene_files
-from lanestream_exporter.samples.patch_store import write_store
 from lanestream_exporter.samples.patches import PatchMaker
-from lanestream_exporter.samples.prior_regressor import prior_estimator
+from lanestream_exporter.samples.prior_regressor import PriorRegressor, load_prior_regressor
 from lanestream_exporter.scenes import render_still, sample_scene
 
-Frames = Iterable[tuple[LabelledFrame, Image]]
+# How often the labels of a frame to train on are jittered.
+_JITTER_ROUNDS = 5
 
-_ROUNDS = 5
+# More candidates of a frame to train on than are served: the weaker ones are real negatives, which are scarce.
+_MOST_TO_TRAIN = 32
 
-# Sizes of rendered stills and how often each is drawn: cameras differ, and so does how sharp a strip is.
+# Sizes of rendered stills and how often each is drawn: cameras differ, and so does the sharpness of a patch.
 _SIZES = ((640, 360), (640, 480), (960, 540), (1280, 720))
 _SHARES = (0.4, 0.2, 0.25, 0.15)
 
+# High quality without chroma subsampling: compression must not give away which patches are rendered.
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 93, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+
 
 @dataclass(frozen=True)
-class PatchStores:
-    """Files in `folder` with patches of `size` x `size` pixels; those already there are kept.
+class PatchStore:
+    """Encoded RGB patches one after another in `data`, patch i at `offsets[i]:offsets[i + 1]`; `labels` is (N,)."""
 
-    Candidates are proposed as with the regressor at `guide`, an ONNX file, where there is one, else without.
+    data: NDArray[np.uint8]
+    offsets: NDArray[np.int64]
+    labels: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def patch(self, index: int) -> NDArray[np.uint8]:
+        """Returns one RGB patch (H, W, 3)."""
+        encoded = self.data[self.offsets[index] : self.offsets[index + 1]]
+        return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB), dtype=np.uint8)
+
+
+def write_store(path: Path, patches: Iterable[tuple[NDArray[np.uint8], int]]) -> int:
+    """Writes RGB patches with their labels to `path` (.npz) atomically and returns their number."""
+    encoded: list[NDArray[np.uint8]] = []
+    labels: list[int] = []
+    for patch, label in patches:
+        encoded.append(cv2.imencode(".jpg", patch[:, :, ::-1], _JPEG)[1].ravel())
+        labels.append(label)
+    offsets = np.cumsum([0, *(len(data) for data in encoded)])
+    data = np.concatenate(encoded) if encoded else np.zeros(0, np.uint8)
+    unfinished = path.with_suffix(".part.npz")
+    np.savez(unfinished, data=data, offsets=offsets, labels=np.asarray(labels, dtype=np.int64))
+    unfinished.replace(path)
+    return len(labels)
+
+
+def read_stores(paths: Sequence[Path]) -> PatchStore:
+    """Returns all patches of the files at `paths` as one store. Raises LabelError for a file without patches."""
+    parts: list[PatchStore] = []
+    for path in paths:
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                parts.append(PatchStore(file["data"], file["offsets"], file["labels"]))
+        except (OSError, ValueError, KeyError) as error:
+            raise LabelError(f"{path} is not a file of patches", "delete it, and it is made again") from error
+    starts = np.cumsum([0, *(len(part.data) for part in parts)])
+    offsets = [part.offsets[:-1] + start for part, start in zip(parts, starts, strict=False)]
+    return PatchStore(
+        np.concatenate([part.data for part in parts]),
+        np.concatenate([*offsets, starts[-1:]]).astype(np.int64),
+        np.concatenate([part.labels for part in parts]),
+    )
+
+
+@dataclass(frozen=True)
+class PatchCache:
+    """Files in `folder` with patches of `size` x `size` pixels. Existing files are kept.
+
+    Candidates are proposed with the ego-lane prior of `regressor`, an ONNX file, if given.
     """
 
     folder: Path
     size: int
-    guide: Path | None = None
+    regressor: Path | None = None
 
     def rendered(self, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
-        """Files of patches, the n-th from `scenes[n]` scenes and seeded by n.
+        """Returns files of patches, the n-th from `scenes[n]` scenes and seeded by n; writes missing ones.
 
-        `done` is called with the number of scenes of each file as it is finished.
+        `done` is called with the number of scenes of each file when it is finished. Raises ModelError for a bad
+        regressor.
         """
-        write = partial(_render_file, self.size, self.guide)
+        write = partial(_write_rendered, self.size, self.regressor)
         return scene_files(self.folder, f"rendered-{self._kind}", scenes, write, workers, done)
 
-    def labelled(self, name: str, frames: Callable[[], Frames], to_train: bool) -> Path:
-        """One file of patches, told by its `name`, from labelled frames and their BGR pictures.
+    def labelled(self, name: str, frames: Callable[[], LabelledImages], to_train: bool) -> Path:
+        """Returns the file `name` of patches of labeled frames; writes it if missing.
 
-        Frames give their own candidates; those to train on also candidates beside their labels, a few times.
+        Patches are cut from the proposed candidates; for training also from jittered labels, several times. Raises
+        ModelError for a bad regressor.
         """
         path = self.folder / f"{name}-{self._kind}.npz"
         if not path.exists():
             self.folder.mkdir(parents=True, exist_ok=True)
-            # More candidates than are served: the weaker ones are the real negatives, of which there are too few.
-            search = CandidateSearch(limit=32) if to_train else CandidateSearch()
-            maker = PatchMaker(search, PatchCutter(PatchGeometry(self.size)), glance=_glanced(self.guide))
+            limit = _MOST_TO_TRAIN if to_train else MOST_CANDIDATES
+            maker = PatchMaker(PatchGeometry(self.size), _prior_or_none(self.regressor), limit)
             write_store(path, _labelled_patches(maker, frames(), to_train))
         return path
 
     @property
     def _kind(self) -> str:
-        """What files of these patches are told by: another guide's are others. Raises ModelError for a bad one."""
-        if self.guide is None:
+        """The part of the file names that differs by patch size and regressor."""
+        if self.regressor is None:
             return f"{self.size}"
-        prior_estimator(self.guide)  # what is no guide is told now, not by another process in the middle of a file
-        return f"{self.size}-guided-{hashlib.sha256(self.guide.read_bytes()).hexdigest()[:8]}"
+        load_prior_regressor(self.regressor)  # reports a bad file here rather than in another process
+        return f"{self.size}-prior-{hashlib.sha256(self.regressor.read_bytes()).hexdigest()[:8]}"
 
 
-def _glanced(guide: Path | None) -> EgoPriorEstimator | None:
-    return None if guide is None else prior_estimator(guide)
+def _prior_or_none(regressor: Path | None) -> PriorRegressor | None:
+    return None if regressor is None else load_prior_regressor(regressor)
 
 
-def _render_file(size: int, guide: Path | None, number: int, scenes: int, path: Path) -> None:
-    maker = PatchMaker(cutter=PatchCutter(PatchGeometry(size)), glance=_glanced(guide))
+def _write_rendered(size: int, regressor: Path | None, number: int, scenes: int, path: Path) -> None:
+    maker = PatchMaker(PatchGeometry(size), _prior_or_none(regressor))
     write_store(path, _rendered_patches(maker, number, scenes))
 
 
@@ -87,15 +144,18 @@ def _rendered_patches(maker: PatchMaker, number: int, scenes: int) -> Iterator[t
         rng = np.random.default_rng([number, index])
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
         still = render_still(sample_scene(rng, width, height))
-        view = RoadView(width, height, still.horizon)
-        yield from maker.all_of(still.image, still.labels, view, rng)
+        labels, image = to_working(still.labels, still.image)
+        horizon = Scaling.to_working_width(width).to_working(still.horizon)
+        yield from maker.all_of(image, labels, RoadView(labels.width, labels.height, horizon), rng)
 
 
-def _labelled_patches(maker: PatchMaker, frames: Frames, to_train: bool) -> Iterator[tuple[NDArray[np.uint8], int]]:
+def _labelled_patches(
+    maker: PatchMaker, frames: LabelledImages, to_train: bool
+) -> Iterator[tuple[NDArray[np.uint8], int]]:
     clear = partial(filter, lambda item: item[1] in (0, 1))
-    for number, (frame, image) in enumerate(frames):
+    for number, (frame, image) in enumerate(itertools.starmap(to_working, frames)):
         rng = np.random.default_rng([number, 1])
         proposals = maker.propose(image)
         yield from clear(zip(*maker.proposed(image, frame, proposals), strict=True))
-        for _ in range(_ROUNDS if to_train else 0):
+        for _ in range(_JITTER_ROUNDS if to_train else 0):
             yield from clear(zip(*maker.jittered(image, frame, proposals.view, rng), strict=True))

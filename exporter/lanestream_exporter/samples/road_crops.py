@@ -1,8 +1,8 @@
-"""Training samples of the regressor: the canonical picture of a frame, moved as other cameras and roads would show it.
+"""Training samples of the regressor: road crops of frames, warped as other cameras and roads would show them.
 
-On a flat road a boundary is x = v + b u + k / u with u = y - horizon. A camera that looks elsewhere changes v, one
-further to a side changes b, a nearer zoom scales x and u, and a road of another bend changes k: each is a warp of the
-picture, so one labelled frame tells of many.
+On a flat road a boundary is x = v + b u + k / u with u = y - horizon. Another viewing direction changes v, another
+lateral position of the camera changes b, a zoom scales x and u, and another curvature of the road changes k. Each is a
+warp of the image, so one labeled frame yields many samples.
 """
 
 from __future__ import annotations
@@ -14,29 +14,31 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.regression_detector import HORIZONS, RoadCropGeometry
+from lanestream.detection.ego_prior import UNKNOWN_HORIZONS
+from lanestream.road.crops import FloatMap, RoadCropGeometry
 from lanestream.road.curve import FloatArray
 from lanestream.road.view import RoadView
 from lanestream_exporter.samples.road_frames import RoadFrame
 
-# The shares of the depth at which errors are counted.
+# The shares of the rows below the horizon at which errors are measured.
 SHARES: Final = (1.0, 0.8, 0.62, 0.48, 0.37, 0.28, 0.21, 0.16, 0.12)
 
-# How strongly roads are bent, and how often so: motorways bend by a hundredth of the depth, mountain roads by a tenth.
-_BENDS: Final = (0.012, 0.03, 0.08)
-_BENT: Final = (0.6, 0.3, 0.1)
+# Standard deviations of the curvature term, as shares of the rows below the horizon, and how often each is drawn.
+# Highways have about a hundredth, mountain roads a tenth.
+_CURVATURE_SIGMAS: Final = (0.012, 0.03, 0.08)
+_CURVATURE_SHARES: Final = (0.6, 0.3, 0.1)
 
-# Above this share of the depth a bend is not followed: it would tear the picture apart at the horizon.
-_BENT_FROM: Final = 0.05
+# Closer to the horizon than this share of the rows the curvature is not applied: it would tear the image apart.
+_CURVED_FROM: Final = 0.05
 
 
 @dataclass(frozen=True)
-class Target:
-    """What the regressor should have said of a canvas.
+class RegressionTarget:
+    """The true outputs of the regressor for a road crop.
 
-    `columns` (2, S) of the left and the right boundary at `SHARES` of the depth under the true horizon, in image widths
-    from the middle; `known` (2, S) is 1 where the label says so; `presence` (2,) is 1, 0, or -1 where nobody can tell;
-    `horizon` in depths below where the canvas took it to be.
+    `columns` (2, S) are those of the left and the right boundary at `SHARES` of the rows below the true horizon, in
+    image widths from the center; `known` (2, S) weighs them, 1 within a label; `presence` (2,) is 1, 0, or -1 if
+    unknown; `horizon` is its offset below the assumed horizon, as a share of the rows below that.
     """
 
     columns: NDArray[np.float32]
@@ -47,103 +49,108 @@ class Target:
 
 @dataclass(frozen=True)
 class Warp:
-    """A move of the camera or the road: `pan` in image widths, `side` in columns a row, `zoom`, `bend` in depths.
+    """A change of the camera or the road.
 
-    `assumed` is how far the canvas takes the horizon to be from where it is, in depths; `flipped` mirrors all.
+    `pan` is in image widths, `side` in columns per row, `curvature` as a share of the rows below the horizon; `flipped`
+    mirrors the image. `assumed` is the error of the horizon that the crop is cut with, as a share of those rows.
     """
 
     pan: float = 0.0
     side: float = 0.0
     zoom: float = 1.0
-    bend: float = 0.0
+    curvature: float = 0.0
     assumed: float = 0.0
     flipped: bool = False
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator) -> Warp:
-        """A random one: mostly small, as cameras mostly look ahead from within their lane."""
-        far_off = rng.random() < 0.2
+    def random(cls, rng: np.random.Generator) -> Warp:
+        """Returns a random warp, usually a small one: most cameras look ahead from within their lane."""
+        horizon_unknown = rng.random() < 0.2
         return cls(
             pan=rng.normal(0.0, 0.06),
             side=rng.normal(0.0, 0.15),
             zoom=float(np.exp(rng.normal(0.0, 0.12))),
-            bend=rng.normal(0.0, rng.choice(_BENDS, p=_BENT)),
-            assumed=rng.uniform(-0.25, 0.25) if far_off else rng.normal(0.0, 0.02),
+            curvature=rng.normal(0.0, rng.choice(_CURVATURE_SIGMAS, p=_CURVATURE_SHARES)),
+            assumed=rng.uniform(-0.25, 0.25) if horizon_unknown else rng.normal(0.0, 0.02),
             flipped=bool(rng.random() < 0.5),
         )
 
 
-def sample(frame: RoadFrame, geometry: RoadCropGeometry, warp: Warp) -> tuple[NDArray[np.uint8], Target]:
-    """The canvas (size, size, 3) in RGB of a frame under `warp`, and what is true of it."""
+def warped_road_crop(
+    frame: RoadFrame, geometry: RoadCropGeometry, warp: Warp
+) -> tuple[NDArray[np.uint8], RegressionTarget]:
+    """Returns the road crop (size, size, 3) in RGB of a frame under `warp`, and its target."""
     view = RoadView(frame.width, frame.height, frame.horizon)
-    seen = RoadView(frame.width, frame.height, frame.horizon + warp.assumed * view.depth)
-    columns, rows = geometry.grid(seen)
+    assumed = RoadView(frame.width, frame.height, frame.horizon + warp.assumed * view.depth)
+    columns, rows = geometry.grid(assumed)
     source_columns, source_rows = _source(columns, rows, view, warp)
-    canvas = cv2.remap(
+    crop = cv2.remap(
         frame.image(), source_columns.astype(np.float32), source_rows.astype(np.float32),
         cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
-    rgb = np.asarray(cv2.cvtColor(canvas, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-    return rgb, _target([_moved(lane, view, warp) for lane in frame.lanes], frame, view, seen)
+    rgb = np.asarray(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return rgb, _target([_warped(lane, view, warp) for lane in frame.lanes], frame, view, assumed)
 
 
 def plain_warp(frame: RoadFrame, known: bool) -> Warp:
-    """No move at all; the horizon where it is if `known`, else where an unknown frame's best look takes it to be."""
+    """Returns no warp, with the true horizon if `known`, else the closest of the horizons tried on a new camera."""
     depth = frame.height - 1.0 - frame.horizon
-    looks = [(share * frame.height - frame.horizon) / depth for share in HORIZONS]
-    return Warp(assumed=0.0 if known else min(looks, key=abs))
+    tried = [(share * frame.height - frame.horizon) / depth for share in UNKNOWN_HORIZONS]
+    return Warp(assumed=0.0 if known else min(tried, key=abs))
 
 
-def _source(columns: FloatArray, rows: FloatArray, view: RoadView, warp: Warp) -> tuple[FloatArray, FloatArray]:
-    """Where in the frame a pixel of the moved picture comes from: the moves undone, last first."""
-    middle = (view.width - 1) / 2.0
-    x = 2.0 * middle - columns if warp.flipped else columns
+def _source(columns: FloatMap, rows: FloatMap, view: RoadView, warp: Warp) -> tuple[FloatMap, FloatMap]:
+    """Returns where in the frame a pixel of the warped image comes from: the changes undone, last one first."""
+    center = (view.width - 1) / 2.0
+    x = 2.0 * center - columns if warp.flipped else columns
     u = rows - view.horizon
-    bent = np.where(u > 0.0, u / view.depth, 0.0)
-    # k / u, which falls back to nothing where the bend is no longer followed.
-    gone = warp.bend * view.depth * bent / np.maximum(bent, _BENT_FROM) ** 2
-    x = x - gone - warp.side * np.maximum(u, 0.0) - warp.pan * view.width
-    return middle + (x - middle) / warp.zoom, view.horizon + u / warp.zoom
+    share = np.where(u > 0.0, u / view.depth, 0.0)
+    # k / u, which fades to zero where the curvature is no longer applied.
+    curved = warp.curvature * view.depth * share / np.maximum(share, _CURVED_FROM) ** 2
+    x = x - curved - warp.side * np.maximum(u, 0.0) - warp.pan * view.width
+    return center + (x - center) / warp.zoom, view.horizon + u / warp.zoom
 
 
-def _moved(lane: FloatArray, view: RoadView, warp: Warp) -> FloatArray:
-    """A polyline (N, 2) of the frame in the moved picture, without what is too near to the horizon to be followed."""
-    middle = (view.width - 1) / 2.0
+def _warped(lane: FloatArray, view: RoadView, warp: Warp) -> FloatArray:
+    """Returns a polyline (N, 2) of the frame in the warped image, without points too close to the horizon."""
+    center = (view.width - 1) / 2.0
     u = (lane[:, 1] - view.horizon) * warp.zoom
-    x = middle + (lane[:, 0] - middle) * warp.zoom + warp.pan * view.width + warp.side * u
+    x = center + (lane[:, 0] - center) * warp.zoom + warp.pan * view.width + warp.side * u
     share = u / view.depth
-    x = x + warp.bend * view.depth / np.maximum(share, _BENT_FROM)
-    x = 2.0 * middle - x if warp.flipped else x
-    return np.stack([x, view.horizon + u], axis=1)[share > 1.5 * _BENT_FROM]
+    x = x + warp.curvature * view.depth / np.maximum(share, _CURVED_FROM)
+    x = 2.0 * center - x if warp.flipped else x
+    return np.stack([x, view.horizon + u], axis=1)[share > 1.5 * _CURVED_FROM]
 
 
-def _target(lanes: list[FloatArray], frame: RoadFrame, view: RoadView, seen: RoadView) -> Target:
+def _target(lanes: list[FloatArray], frame: RoadFrame, view: RoadView, assumed: RoadView) -> RegressionTarget:
     rows = view.horizon + np.asarray(SHARES) * view.depth
-    middle = (frame.width - 1) / 2.0
-    told = [_at(lane, rows, view) for lane in lanes if len(lane) >= 3]
+    center = (frame.width - 1) / 2.0
+    sampled = [_at(lane, rows, view) for lane in lanes if len(lane) >= 3]
     columns = np.zeros((2, len(SHARES)), np.float32)
     known = np.zeros((2, len(SHARES)), np.float32)
     presence = np.full(2, 0.0 if frame.exhaustive else -1.0, np.float32)
     for side, sign in ((0, -1.0), (1, 1.0)):
-        beside = [(sign * (x[0] - middle), index) for index, (x, _) in enumerate(told) if sign * (x[0] - middle) > 0.0]
-        if beside:
-            x, weight = told[min(beside)[1]]
-            columns[side], known[side] = (x - middle) / frame.width, weight
+        candidates = [
+            (sign * (x[0] - center), index) for index, (x, _) in enumerate(sampled) if sign * (x[0] - center) > 0.0
+        ]
+        if candidates:
+            x, weight = sampled[min(candidates)[1]]
+            columns[side], known[side] = (x - center) / frame.width, weight
             presence[side] = 1.0
-    return Target(columns, known, presence, (view.horizon - seen.horizon) / seen.depth)
+    return RegressionTarget(columns, known, presence, (view.horizon - assumed.horizon) / assumed.depth)
 
 
 def _at(lane: FloatArray, rows: FloatArray, view: RoadView) -> tuple[FloatArray, FloatArray]:
-    """Columns of a polyline at `rows`, and how well they are known: 1 within it, less where it has to be continued."""
+    """Returns the columns of a polyline at `rows` and their weights: 1 within it, less where it is extrapolated."""
     u = lane[:, 1] - view.horizon
     below = rows - view.horizon
-    # Near the camera a boundary is nearly straight; a short label does not tell its bend.
+    # Near the camera a boundary is nearly straight, and a short label does not determine its curvature.
     basis = [np.ones_like(u), u, view.depth / u] if u.max() > 2.0 * u.min() else [np.ones_like(u), u]
     at_rows = [np.ones_like(below), below, view.depth / below][: len(basis)]
     coefficients = np.linalg.lstsq(np.stack(basis, axis=1), lane[:, 0], rcond=None)[0]
-    continued = np.stack(at_rows, axis=1) @ coefficients
+    extrapolated = np.stack(at_rows, axis=1) @ coefficients
     order = np.argsort(lane[:, 1], kind="stable")
     inside = (rows >= lane[:, 1].min() - 1.0) & (rows <= lane[:, 1].max() + 1.0)
-    columns = np.where(inside, np.interp(rows, lane[order, 1], lane[order, 0]), continued)
+    columns = np.where(inside, np.interp(rows, lane[order, 1], lane[order, 0]), extrapolated)
     nearer = rows > lane[:, 1].max()
     return columns, np.where(inside, 1.0, np.where(nearer, 0.3, 0.0))

@@ -1,4 +1,4 @@
-"""Frames for the regressor, kept small: pictures at the width that it looks at, boundaries and horizon beside them."""
+"""Small frames for the regressor: images at its detail width, with boundaries and horizon."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lanestream.detection.features import resized
-from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.errors import LabelError
+from lanestream.images.resizing import resized, working_image
+from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import FloatArray
-from lanestream.road.view import Image, Scaling
+from lanestream.road.view import WORKING_WIDTH, Image, Scaling
 from lanestream_exporter.datasets.horizons import shared_horizon
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import LabelledFrame, LabelledImages, LabelledLane
 from lanestream_exporter.samples.cache import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
 
+# The regressor warps images of this width.
+_DETAIL_WIDTH = RoadCropGeometry.detail_width
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
 _SIZES = ((448, 252), (448, 336), (640, 360))
 _SHARES = (0.5, 0.35, 0.15)
@@ -27,10 +29,10 @@ _SHARES = (0.5, 0.35, 0.15)
 
 @dataclass(frozen=True)
 class RoadFrame:
-    """A frame as the regressor learns from it: its picture as JPEG bytes, and in pixels of that picture its boundaries.
+    """A frame that the regressor learns from: its image as JPEG bytes, and its boundaries in pixels of that image.
 
     `lanes` are polylines (N, 2) from the lowest row upwards; `horizon` is the row at which they meet. `exhaustive` says
-    that an ego boundary without label is not there. `group` names the drive or clip.
+    that an ego boundary without a label is absent. `group` names the drive or clip.
     """
 
     jpeg: bytes
@@ -42,21 +44,18 @@ class RoadFrame:
     group: str
 
     def image(self) -> Image:
-        """The picture, BGR (H, W, 3)."""
+        """Returns the image, BGR (H, W, 3)."""
         return np.asarray(cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
 
     @classmethod
-    def of(cls, frame: LabelledFrame, image: Image, about: float | None = None) -> RoadFrame | None:
-        """A labelled frame made small; None where its labels don't tell a horizon and `about` doesn't either."""
-        scaling = Scaling(min(1.0, RegressionDetector.detail_width / frame.width))
-        lanes = tuple(
-            np.stack([(lane.points[:, i] + 0.5) * scaling.factor - 0.5 for i in (0, 1)], axis=1)
-            for lane in frame.lanes
-            if len(lane.points) >= 3
-        )
-        small = resized(image, scaling)
+    def of(cls, frame: LabelledFrame, image: Image, expected_horizon: float | None = None) -> RoadFrame | None:
+        """Returns a labeled frame made small; None if its labels don't determine a horizon and none is expected."""
+        scaling = Scaling(min(1.0, _DETAIL_WIDTH / frame.width))
+        lanes = tuple(scaling.to_working(lane.points) for lane in frame.lanes if len(lane.points) >= 3)
+        # As the regressor does in service: to the working width first.
+        small = image if scaling.factor == 1.0 else resized(working_image(image)[0], _DETAIL_WIDTH / WORKING_WIDTH)
         height, width = small.shape[:2]
-        expected = None if about is None else scaling.to_working(about)
+        expected = None if expected_horizon is None else scaling.to_working(expected_horizon)
         horizon = shared_horizon(lanes, height, expected)
         if horizon is None:
             return None
@@ -65,59 +64,59 @@ class RoadFrame:
 
 
 def rendered_frames(folder: Path, scenes: Sequence[int], workers: int, done: Callable[[int], None]) -> list[Path]:
-    """A file of rendered frames for each number of `scenes`, the files seeded by their own number; kept where they are.
+    """Returns files of rendered frames, the n-th with `scenes[n]` scenes and seeded by n; existing files are kept.
 
-    `done` is told how many scenes have become ready.
+    `done` is called with the number of scenes of each file when it is finished.
     """
     return scene_files(folder, "frames", scenes, _render_file, workers, done)
 
 
-def road_frames(labelled: Iterable[tuple[LabelledFrame, Image]]) -> list[RoadFrame]:
-    """Labelled frames with their BGR images, made small; those with a single boundary have their drive's horizon."""
+def road_frames(labelled: LabelledImages) -> list[RoadFrame]:
+    """Returns labeled frames made small. Frames with a single boundary get about their drive's horizon."""
     drives: dict[str, list[tuple[LabelledFrame, Image]]] = {}
     for frame, image in labelled:
         drives.setdefault(frame.group, []).append((frame, image))
     frames = []
     for drive in drives.values():
         first = [RoadFrame.of(frame, image) for frame, image in drive]
-        told = [f.horizon / f.height for f in first if f is not None]
-        usual = float(np.median(told)) if told else None
+        horizons = [f.horizon / f.height for f in first if f is not None]
+        median = float(np.median(horizons)) if horizons else None
         for frame, image in drive:
-            small = RoadFrame.of(frame, image, None if usual is None else usual * frame.height)
+            small = RoadFrame.of(frame, image, None if median is None else median * frame.height)
             frames += [] if small is None else [small]
     return frames
 
 
 def write_frames(path: Path, frames: Iterable[RoadFrame]) -> int:
-    """Writes frames to `path` (.npz), whole or not at all; returns how many."""
+    """Writes frames to `path` (.npz) atomically and returns their number."""
     kept = list(frames)
     data = np.frombuffer(b"".join(f.jpeg for f in kept), np.uint8)
     sizes = np.array([len(f.jpeg) for f in kept], dtype=np.int64)
-    notes = json.dumps([_note(f) for f in kept])
+    records = json.dumps([_record(f) for f in kept])
     unfinished = path.with_suffix(".part.npz")
-    np.savez(unfinished, data=data, sizes=sizes, notes=np.frombuffer(notes.encode(), np.uint8))
+    np.savez(unfinished, data=data, sizes=sizes, notes=np.frombuffer(records.encode(), np.uint8))
     unfinished.replace(path)
     return len(kept)
 
 
 def read_frames(path: Path) -> list[RoadFrame]:
-    """The frames in a file of `write_frames`. Raises LabelError for a file that is none."""
+    """Returns the frames in a file of `write_frames`. Raises LabelError for any other file."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            data, sizes, notes = file["data"], file["sizes"], json.loads(file["notes"].tobytes())
+            data, sizes, records = file["data"], file["sizes"], json.loads(file["notes"].tobytes())
     except (OSError, ValueError, KeyError) as error:
-        raise LabelError(f"{path} is not a file of frames", "delete it to have it made again") from error
+        raise LabelError(f"{path} is not a file of frames", "delete it, and it is made again") from error
     ends = np.cumsum(sizes)
     return [
         RoadFrame(
             data[end - size : end].tobytes(),
-            **{**note, "lanes": tuple(np.asarray(lane, dtype=float) for lane in note["lanes"])},
+            **{**record, "lanes": tuple(np.asarray(lane, dtype=float) for lane in record["lanes"])},
         )
-        for end, size, note in zip(ends, sizes, notes, strict=True)
+        for end, size, record in zip(ends, sizes, records, strict=True)
     ]
 
 
-def _note(frame: RoadFrame) -> dict[str, object]:
+def _record(frame: RoadFrame) -> dict[str, object]:
     return {
         "width": frame.width,
         "height": frame.height,
@@ -137,13 +136,13 @@ def _rendered(number: int, scenes: int) -> Iterator[RoadFrame]:
         rng = np.random.default_rng([number, index, 2])
         width, height = _SIZES[rng.choice(len(_SIZES), p=_SHARES)]
         still = render_still(sample_scene(rng, width, height))
-        frame = RoadFrame.of(_near(still.labels), still.image, still.horizon)
+        frame = RoadFrame.of(_without_far_lanes(still.labels), still.image, still.horizon)
         if frame is not None:
             yield frame
 
 
-def _near(frame: LabelledFrame) -> LabelledFrame:
-    """The labels without what lies beyond the next lanes: it bounds no lane that the camera could be in soon."""
+def _without_far_lanes(frame: LabelledFrame) -> LabelledFrame:
+    """Returns the labels without boundaries beyond the neighboring lanes."""
     lanes: tuple[LabelledLane, ...] = tuple(
         lane for lane in frame.lanes if lane.position is None or abs(lane.position) <= 2
     )

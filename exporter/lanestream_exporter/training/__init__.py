@@ -1,1 +1,1 @@
-"""Training: what a run is told, the loop that every network learns in, and what the networks are trained for."""
+"""Training: recipes, data sources, the training loop, and the task of each network."""

@@ -1,4 +1,4 @@
-"""The classifier's task: rendered and real patches mixed, more real ones towards the end."""
+"""The classifier's task: a mix of rendered and real patches, with more real ones towards the end."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lanestream.errors import CheckpointError
-from lanestream_exporter.alexnet import AlexNet, initialise, load_state, normalise
+from lanestream_exporter.alexnet import AlexNet, load_state, load_torchvision_weights, normalize
 from lanestream_exporter.samples.augment import augmented
-from lanestream_exporter.samples.patch_store import PatchStore
+from lanestream_exporter.samples.patch_files import PatchStore
 from lanestream_exporter.training.config import ClassifierConfig
-from lanestream_exporter.training.loop import CHOOSES, Batch
-from lanestream_exporter.training.patchfiles import PatchSource
-from lanestream_exporter.training.scores import scores
+from lanestream_exporter.training.data_sources import PatchSource
+from lanestream_exporter.training.loop import SELECTED_BY, Batch, autocast
 
 
 class ClassifierTask:
-    """Teaches `network` to tell true candidates from false ones, by one source or by a rendered and a real one.
+    """Trains `network` to tell true candidates from false ones, on a rendered or a real source, or on both.
 
-    `origin` is what to remember of where the patches came from.
+    `origin` is recorded with the run: where the patches came from.
     """
 
     def __init__(
@@ -37,37 +36,37 @@ class ClassifierTask:
         self.data: dict[str, Any] = {**origin, **{source.name: source.counts for source in sources}}
 
     def batch(self, step: int) -> Batch:
-        """RGB patches (N, H, W, 3) uint8 after augmentation, and their labels (N,)."""
+        """Returns augmented RGB patches (N, H, W, 3) uint8 and their labels (N,)."""
         config = self._config
         rng = np.random.default_rng([config.seed, step])
         share = config.data.real_share if step < config.steps * 2 // 3 else config.data.final_real_share
         real = round(config.batch * share)
-        wanted = [("real", real), ("rendered", config.batch - real)]
-        drawn = [draw(self._sources[name], count, rng) for name, count in wanted if count]
-        patches, labels = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        counts = [("real", real), ("rendered", config.batch - real)]
+        samples = [draw_patches(self._sources[name], count, rng) for name, count in counts if count]
+        patches, labels = (np.concatenate(parts) for parts in zip(*samples, strict=True))
         return torch.from_numpy(augmented(patches, labels, config.augmentation, rng)), torch.from_numpy(labels)
 
     def loss(self, network: nn.Module, batch: Batch) -> Tensor:
-        """The cross entropy, with smoothed labels."""
+        """Returns the cross entropy with smoothed labels."""
         patches, labels = batch
-        # Convolutions on the CPU are faster with the channels last.
-        logits: Tensor = network(normalise(patches).contiguous(memory_format=torch.channels_last))
+        # Convolutions on the CPU are faster with channels last.
+        logits: Tensor = network(normalize(patches).contiguous(memory_format=torch.channels_last))
         return functional.cross_entropy(logits.float(), labels, label_smoothing=self._config.label_smoothing)
 
     def check(self, network: nn.Module) -> dict[str, float]:
-        """Loss and accuracy of each source, both classes weighing the same; the mean loss chooses."""
-        measured = {name: _measured(network, source.check) for name, source in self._sources.items()}
-        figures = {CHOOSES: sum(loss for loss, _ in measured.values()) / len(measured)}
+        """Returns loss and accuracy of each source, with equal class weights; the mean loss selects the network."""
+        measured = {name: _loss_and_accuracy(network, source.check) for name, source in self._sources.items()}
+        figures = {SELECTED_BY: sum(loss for loss, _ in measured.values()) / len(measured)}
         for name, (loss, accuracy) in measured.items():
             figures |= {f"{name}_loss": loss, f"{name}_accuracy": accuracy}
         return figures
 
 
 def starting_network(config: ClassifierConfig) -> AlexNet:
-    """The network before its first step: by the seed, or with the weights of `initial`.
+    """Returns the network before its first step: random by the seed, or with the weights of `initial`.
 
-    Those are all weights of a run's checkpoint, or the hidden layers of a torchvision AlexNet. Raises CheckpointError
-    where the file is neither.
+    `initial` is the checkpoint of a classifier run, or a torchvision AlexNet, of which the last layer is not used.
+    Raises CheckpointError if the file is neither.
     """
     torch.manual_seed(config.seed)
     network = AlexNet(shape=config.network.shape)
@@ -76,18 +75,20 @@ def starting_network(config: ClassifierConfig) -> AlexNet:
     weights = Path(config.initial)
     state = load_state(weights)
     if "network" not in state:
-        initialise(network, weights)
+        load_torchvision_weights(network, weights)
         return network
     try:
         network.load_state_dict(state["network"])
     except (RuntimeError, TypeError, AttributeError) as error:
-        hint = "give the best.pt of a classifier's run, or torchvision's alexnet weights"
+        hint = "give the best.pt of a classifier run, or torchvision's alexnet weights"
         raise CheckpointError(f"{weights} holds another network", hint) from error
     return network
 
 
-def draw(source: PatchSource, count: int, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """`count` patches of a source to train on, half of them true, and their labels."""
+def draw_patches(
+    source: PatchSource, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Returns `count` random training patches of a source, half of them true, and their labels."""
     store = source.train
     chosen = [
         rng.choice(np.flatnonzero(store.labels == label), size)
@@ -97,12 +98,26 @@ def draw(source: PatchSource, count: int, rng: np.random.Generator) -> tuple[NDA
     return np.stack([store.patch(int(i)) for i in index]), store.labels[index]
 
 
-def _measured(network: nn.Module, store: PatchStore) -> tuple[float, float]:
-    """Mean cross entropy and accuracy over a store, both classes weighing the same."""
-    logits = scores(network, store)
+@torch.inference_mode()
+def patch_logits(network: nn.Module, store: PatchStore, batch: int = 64) -> NDArray[np.float32]:
+    """Returns logits (N, classes) of all patches of a store."""
+    network.eval()
+    device = next(network.parameters()).device
+    parts = []
+    for start in range(0, len(store), batch):
+        patches = np.stack([store.patch(i) for i in range(start, min(start + batch, len(store)))])
+        with autocast(device):
+            logits = network(normalize(torch.from_numpy(patches).to(device)))
+        parts.append(logits.float().cpu().numpy())
+    return np.concatenate(parts)
+
+
+def _loss_and_accuracy(network: nn.Module, store: PatchStore) -> tuple[float, float]:
+    """Returns mean cross entropy and accuracy over a store, with equal class weights."""
+    logits = patch_logits(network, store)
     losses = functional.cross_entropy(
         torch.from_numpy(logits), torch.from_numpy(store.labels), reduction="none"
     ).numpy()
-    right = logits.argmax(axis=1) == store.labels
+    correct = logits.argmax(axis=1) == store.labels
     classes = [store.labels == label for label in (0, 1)]
-    return tuple(float(np.mean([values[chosen].mean() for chosen in classes])) for values in (losses, right))  # type: ignore[return-value]
+    return tuple(float(np.mean([values[chosen].mean() for chosen in classes])) for values in (losses, correct))  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""What a data set holds, leaks between drives, splits by drive, and the contact sheet."""
+"""The check of a data set, leaks between drives, splits by drive, and the contact sheet."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from labelfiles import Draw, check_of, clip_record, write_lines
+from labelfiles import Draw, check_dataset, clip_record, write_lines
 
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.contact_sheet import ContactSheet
@@ -16,42 +16,42 @@ from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.datasets.splits import refuse_leak, split_by_group
 
 
-def test_a_frame_that_is_labelled_twice_is_named(tmp_path: Path, draw: Draw) -> None:
+def test_a_frame_that_is_labeled_twice_is_reported(tmp_path: Path, draw: Draw) -> None:
     draw("a.jpg")
     write_lines(tmp_path / "labels.jsonl", *[clip_record(image="a.jpg")] * 2)
-    (fault,) = check_of(tmp_path).faults
-    assert "labels.jsonl:2: a.jpg is labelled a second time, after" in str(fault)
+    (fault,) = check_dataset(tmp_path).faults
+    assert "labels.jsonl:2: a.jpg is labeled a second time, after" in str(fault)
 
 
-def test_a_picture_of_two_drives_is_named(tmp_path: Path, draw: Draw) -> None:
+def test_an_image_of_two_drives_is_reported(tmp_path: Path, draw: Draw) -> None:
     draw("monday/a.jpg")
     (tmp_path / "tuesday").mkdir()
     for name in ("tuesday/b.jpg", "monday/c.jpg"):
         shutil.copy(tmp_path / "monday/a.jpg", tmp_path / name)
     names = "monday/a.jpg", "tuesday/b.jpg", "monday/c.jpg"
     write_lines(tmp_path / "labels.jsonl", *(clip_record(image=name) for name in names))
-    check = check_of(tmp_path)
+    check = check_dataset(tmp_path)
     other, again = map(str, check.faults)
-    assert "labels.jsonl:2: tuesday/b.jpg is the picture of" in other
+    assert "labels.jsonl:2: tuesday/b.jpg has the image of" in other
     assert "/tuesday', not " in other
-    assert "labels.jsonl:3: monday/c.jpg is the picture of" in again
+    assert "labels.jsonl:3: monday/c.jpg has the same image as" in again
     assert check.contents.groups.total() == 3
 
 
-def test_leaks_between_two_sides_are_named(tmp_path: Path, draw: Draw) -> None:
+def test_leaks_between_two_sides_are_reported(tmp_path: Path, draw: Draw) -> None:
     draw("train/monday/a.jpg")
     draw("val/tuesday/b.jpg")
     write_lines(tmp_path / "train" / "labels.jsonl", clip_record(image="monday/a.jpg", clip="road.mp4"))
     write_lines(tmp_path / "val" / "labels.jsonl", clip_record(image="tuesday/b.jpg", clip="street.mp4"))
-    train = check_of(tmp_path / "train")
-    assert train.leaks(check_of(tmp_path / "val")) == []
+    train = check_dataset(tmp_path / "train")
+    assert train.leaks(check_dataset(tmp_path / "val")) == []
     write_lines(tmp_path / "val" / "labels.jsonl", clip_record(image="tuesday/b.jpg", clip="road.mp4"))
-    (leak,) = train.leaks(check_of(tmp_path / "val"))
+    (leak,) = train.leaks(check_dataset(tmp_path / "val"))
     assert "'road' is in both train and validation" in str(leak)
     shutil.copy(tmp_path / "train/monday/a.jpg", tmp_path / "val/tuesday/b.jpg")
     write_lines(tmp_path / "val" / "labels.jsonl", clip_record(image="tuesday/b.jpg", clip="street.mp4"))
-    (leak,) = train.leaks(check_of(tmp_path / "val"))
-    assert "labels.jsonl:1: its picture is on the other side too" in str(leak)
+    (leak,) = train.leaks(check_dataset(tmp_path / "val"))
+    assert "labels.jsonl:1: its image is on the other side too" in str(leak)
 
 
 def test_a_shared_group_is_refused() -> None:
@@ -82,7 +82,7 @@ def test_each_side_of_a_split_has_a_group(share: float) -> None:
 
 
 def test_one_drive_cannot_be_split() -> None:
-    with pytest.raises(LabelError, match="no split of 1 drive"):
+    with pytest.raises(LabelError, match="1 drive or clip can't be split"):
         split_by_group(["a"] * 50, 0.2)
 
 

@@ -1,4 +1,4 @@
-"""Labels of every form, written here and read back: exact polylines."""
+"""Labels of every format are written and read back as the exact polylines."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from labelfiles import (
     Points,
     clip_record,
     cvat_image,
+    draw_mask,
     labelme,
-    painted,
+    line_strip,
     polyline,
     read,
     road,
-    strip,
     tusimple_record,
     write_ccvl,
     write_cvat,
@@ -34,8 +34,9 @@ from labelfiles import (
 
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.caltech import bezier
+from lanestream_exporter.datasets.entries import LabelEntry
 from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.reading import read_dataset
+from lanestream_exporter.datasets.reading import read_dataset, read_entries
 
 
 def points(frame: LabelledFrame) -> list[Points]:
@@ -57,7 +58,15 @@ def test_tusimple_columns_become_points_and_drives_groups(tmp_path: Path, draw: 
     assert frames[1].group != frames[0].group
 
 
-def test_culane_lines_are_cut_at_the_pictures_edge(tmp_path: Path, draw: Draw) -> None:
+def test_tusimple_records_have_a_split_or_not(tmp_path: Path, draw: Draw) -> None:
+    draw("a.jpg")
+    draw("b.jpg")
+    write_lines(tmp_path / "labels.json", tusimple_record("a.jpg") | {"split": "val"}, tusimple_record("b.jpg"))
+    entries = list(read_entries(tmp_path))
+    assert [entry.split for entry in entries if isinstance(entry, LabelEntry)] == ["val", None]
+
+
+def test_culane_lines_are_cut_at_the_edge_of_the_image(tmp_path: Path, draw: Draw) -> None:
     clip = "driver_23_30frame/05151640_0419.MP4"
     draw(f"{clip}/00000.jpg")
     draw(f"{clip}/00030.jpg")
@@ -68,7 +77,7 @@ def test_culane_lines_are_cut_at_the_pictures_edge(tmp_path: Path, draw: Draw) -
     frames = read(tmp_path)
     assert [points(frame) for frame in frames] == [[LEFT], []]
     assert {frame.group for frame in frames} == {clip}
-    assert {frame.group for frame in read(tmp_path / clip)} == {clip}  # from wherever it is looked at
+    assert {frame.group for frame in read(tmp_path / clip)} == {clip}  # whichever path leads there
 
 
 def test_caltech_splines_are_sampled_and_count_from_zero(tmp_path: Path, draw: Draw) -> None:
@@ -83,7 +92,7 @@ def test_caltech_splines_are_sampled_and_count_from_zero(tmp_path: Path, draw: D
     curve, straight = first.lanes
     assert curve.points[0].tolist() == [40.0, 170.0]
     assert curve.points[-1].tolist() == [130.0, 100.0]
-    # De Casteljau's point in the middle of the cubic curve.
+    # The midpoint of the cubic curve by De Casteljau.
     middle = np.array([1.0, 3.0, 3.0, 1.0]) / 8.0 @ control - 1.0
     np.testing.assert_allclose(curve.points[50], middle)
     assert (curve.kind, curve.color, curve.lane_id) == ("double", "yellow", 7)
@@ -101,11 +110,11 @@ def test_a_quadratic_spline_is_a_parabola() -> None:
         bezier(np.zeros((5, 2)))
 
 
-def test_labelme_strips_tell_kind_colour_and_id(tmp_path: Path, draw: Draw) -> None:
+def test_labelme_strips_give_kind_color_and_id(tmp_path: Path, draw: Draw) -> None:
     draw("img/monday/a.jpg")
-    other = strip([[1, 1], [5, 1], [5, 5]], "car", "polygon")
-    downwards = strip(LEFT[::-1], "dashed white", group_id=3)
-    flagged = strip(RIGHT, flags={"yellow": True, "solid": False})
+    other = line_strip([[1, 1], [5, 1], [5, 5]], "car", "polygon")
+    downwards = line_strip(LEFT[::-1], "dashed white", group_id=3)
+    flagged = line_strip(RIGHT, flags={"yellow": True, "solid": False})
     labelme(tmp_path / "ann" / "a.json", "..\\img\\monday\\a.jpg", downwards, other, flagged)
     (frame,) = read(tmp_path)
     assert points(frame) == [LEFT, RIGHT]
@@ -114,23 +123,23 @@ def test_labelme_strips_tell_kind_colour_and_id(tmp_path: Path, draw: Draw) -> N
     assert frame.group == f"{tmp_path.name}/monday"
 
 
-def test_labelme_takes_the_image_that_is_in_the_file(tmp_path: Path) -> None:
+def test_labelme_uses_the_image_inside_the_file(tmp_path: Path) -> None:
     data = base64.b64encode(cv2.imencode(".png", road())[1].tobytes()).decode()
-    labelme(tmp_path / "a.json", "gone.jpg", strip(LEFT), imageData=data)
+    labelme(tmp_path / "a.json", "gone.jpg", line_strip(LEFT), imageData=data)
     ((frame, image),) = read_dataset(tmp_path)
     assert points(frame) == [LEFT]
     np.testing.assert_array_equal(image, road())
 
 
-def test_cvat_images_tell_attributes_and_groups(tmp_path: Path, draw: Draw) -> None:
+def test_cvat_images_give_attributes_and_groups(tmp_path: Path, draw: Draw) -> None:
     draw("images/a.png")
     draw("images/tuesday/b.png")
-    told = "".join(
+    attributes = "".join(
         f'<attribute name="{name}">{value}</attribute>'
         for name, value in (("type", "dashed"), ("Colour", "white"), ("position", "+1"), ("id", "5"))
     )
     box = '<box label="car" xtl="1" ytl="1" xbr="9" ybr="9"/>'
-    first = cvat_image("a.png", polyline(RIGHT[::-1], told), box, polyline(LEFT, label="solid_yellow"))
+    first = cvat_image("a.png", polyline(RIGHT[::-1], attributes), box, polyline(LEFT, label="solid_yellow"))
     write_cvat(tmp_path / "annotations.xml", first, cvat_image("tuesday/b.png"))
     one, two = read(tmp_path)
     assert points(one) == [RIGHT, LEFT]
@@ -176,7 +185,7 @@ def test_clip_labels_are_read_with_their_video(clip: Path) -> None:
         assert [lane.kind for lane in frame.lanes] == [lane["type"] for lane in record["lanes"]]
 
 
-def test_a_video_is_found_beside_the_folder_of_its_labels(tmp_path: Path, clip: Path) -> None:
+def test_a_video_is_found_next_to_the_folder_of_its_labels(tmp_path: Path, clip: Path) -> None:
     (tmp_path / "labels").mkdir()
     (tmp_path / "clips").mkdir()
     shutil.copy(clip / "drive.mp4", tmp_path / "clips")
@@ -192,12 +201,12 @@ def test_clip_labels_are_read_with_images(tmp_path: Path, draw: Draw) -> None:
     (lane,) = frame.lanes
     assert points(frame) == [LEFT]
     assert (lane.lane_id, lane.position, lane.kind, lane.color) == (4, -1, "solid", "yellow")
-    assert (frame.group, frame.source) == ("road", "images/7.jpg")
+    assert (frame.group, frame.source) == ("road", "road.mp4#7")
 
 
-def test_a_binary_mask_gives_a_polyline_a_piece(tmp_path: Path, draw: Draw) -> None:
+def test_a_binary_mask_gives_one_polyline_per_piece(tmp_path: Path, draw: Draw) -> None:
     draw("images/monday/a.jpg")
-    write_mask(tmp_path / "masks" / "monday" / "a.png", painted((LEFT, 255), (RIGHT, 255)))
+    write_mask(tmp_path / "masks" / "monday" / "a.png", draw_mask((LEFT, 255), (RIGHT, 255)))
     (frame,) = read(tmp_path)
     assert frame.group == f"{tmp_path.name}/monday"
     lanes = sorted(frame.lanes, key=lambda lane: lane.points[0, 0])
@@ -210,7 +219,7 @@ def test_a_binary_mask_gives_a_polyline_a_piece(tmp_path: Path, draw: Draw) -> N
 
 def test_an_instance_mask_keeps_dashes_together(tmp_path: Path, draw: Draw) -> None:
     draw("a.jpg")
-    mask = painted((LEFT, 1), (RIGHT, 2))
+    mask = draw_mask((LEFT, 1), (RIGHT, 2))
     mask[120:135] = 0
     write_mask(tmp_path / "a_mask.png", mask)
     (frame,) = read(tmp_path)
@@ -220,16 +229,16 @@ def test_an_instance_mask_keeps_dashes_together(tmp_path: Path, draw: Draw) -> N
         assert lane.points[-1, 1] < 120
 
 
-def test_colours_of_a_mask_are_instances(tmp_path: Path, draw: Draw) -> None:
+def test_colors_of_a_mask_are_instances(tmp_path: Path, draw: Draw) -> None:
     draw("a.jpg")
-    flat = painted((LEFT, 1), (RIGHT, 2))
+    flat = draw_mask((LEFT, 1), (RIGHT, 2))
     write_mask(tmp_path / "a_mask.png", np.array([[0, 0, 0], [0, 0, 200], [90, 0, 200]], np.uint8)[flat])
     assert len(read(tmp_path)[0].lanes) == 2
 
 
 def test_pieces_that_meet_end_where_they_meet(tmp_path: Path, draw: Draw) -> None:
     draw("a.jpg")
-    meeting = painted(([[40, 170], [160, 60], [160, 20]], 9), ([[280, 170], [160, 60]], 9))
+    meeting = draw_mask(([[40, 170], [160, 60], [160, 20]], 9), ([[280, 170], [160, 60]], 9))
     write_mask(tmp_path / "a_mask.png", meeting)
     lanes = read(tmp_path)[0].lanes
     assert sorted(round(float(lane.points[0, 0]), -1) for lane in lanes) == [40, 280]
@@ -238,7 +247,7 @@ def test_pieces_that_meet_end_where_they_meet(tmp_path: Path, draw: Draw) -> Non
 
 def test_holes_and_ragged_edges_do_not_cut_a_piece(tmp_path: Path, draw: Draw) -> None:
     draw("a.jpg")
-    mask = painted()
+    mask = draw_mask()
     mask[20:171, 96:105] = 9
     mask[80:90, 99:101] = 0  # a hole
     mask[60:62, 106] = 9  # a spur that joins from the side, open downwards
@@ -248,18 +257,18 @@ def test_holes_and_ragged_edges_do_not_cut_a_piece(tmp_path: Path, draw: Draw) -
     assert (lane.points[0, 1], lane.points[-1, 1]) == (170, 20)
 
 
-def test_a_form_that_cannot_be_told_is_asked_for(tmp_path: Path, draw: Draw) -> None:
+def test_an_unrecognized_format_must_be_named(tmp_path: Path, draw: Draw) -> None:
     draw("a.jpg")
-    with pytest.raises(LabelError, match="no labels that are known"):
+    with pytest.raises(LabelError, match="no labels of a known format"):
         read(tmp_path)
-    labelme(tmp_path / "a.json", "a.jpg", strip(LEFT))
+    labelme(tmp_path / "a.json", "a.jpg", line_strip(LEFT))
     (tmp_path / "a.lines.txt").write_text("")
-    with pytest.raises(LabelError, match="several forms: culane, labelme"):
+    with pytest.raises(LabelError, match="several formats: culane, labelme"):
         read(tmp_path)
     assert len(read(tmp_path, "labelme")) == 1
-    with pytest.raises(LabelError, match="'openlane' is unknown"):
+    with pytest.raises(LabelError, match="unknown label format 'openlane'"):
         read(tmp_path, "openlane")
     with pytest.raises(LabelError, match="there is nothing at"):
         read(tmp_path / "missing")
-    with pytest.raises(LabelError, match=r"no labelled frames in .* as cvat"):
+    with pytest.raises(LabelError, match=r"no labeled frames of format cvat in"):
         read(tmp_path, "cvat")

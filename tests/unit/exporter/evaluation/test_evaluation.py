@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lanestream.detection import Prepared
-from lanestream.road.curve import Curve
-from lanestream.road.results import Candidate
-from lanestream.road.view import RoadView
+from lanestream.detection.proposals import Proposals
+from lanestream.road.curve import Curve, Curves
+from lanestream.road.view import RoadView, Spans
 from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
 from lanestream_exporter.evaluation.benchmarks import (
     TUSIMPLE_ROWS,
@@ -272,10 +271,10 @@ def test_candidates_under_both_rules() -> None:
     labels = frame(*PAIR, coverage=WHOLE)
     # Shifts of 10, 52 and 90 px are 6.7, 35 and 60 px across the line, at 1280 wide.
     shifts = (0.0, 10.0, 52.0, 90.0)
-    candidates = tuple(Candidate(curve(-1.1, 640.0 + v), 252.0, 719.0, 1.0) for v in shifts)
-    prepared = Prepared(np.zeros((720, 1280, 3), np.uint8), (), view, candidates)
+    spans = Spans(np.full(4, 252.0), np.full(4, 719.0), np.ones(4, bool))
+    proposals = Proposals(Curves.of([curve(-1.1, 640.0 + v) for v in shifts]), spans, view, 1.0, None)
     outputs = np.array([[0.05, 0.95], [0.75, 0.25], [0.05, 0.95], [0.85, 0.15]], np.float32)
-    judged = judge(prepared, outputs, replace(prepared, candidates=candidates[::-1]), labels)
+    judged = judge(proposals, outputs, labels)
     figures = candidate_figures([FrameOutcome(labels, (), judged)], 0.5)
     assert figures["far_40"]["confusion"] == {"tp": 1, "fp": 0, "fn": 1, "tn": 1}
     assert (figures["far_40"]["unsure"], figures["far_30"]["unsure"]) == (1, 0)
@@ -291,7 +290,10 @@ def test_candidates_under_both_rules() -> None:
     decided = candidate_figures([FrameOutcome(labels, (), with_prior)], 0.5)
     assert decided["decided"]["far_40"]["confusion"] == {"tp": 2, "fp": 0, "fn": 0, "tn": 1}
     assert decided["far_40"] == figures["far_40"]
-    recall = figures["proposal_recall"]["ego"]
+    reverse = replace(proposals, curves=proposals.curves.take([3, 2, 1, 0]))
+    ranked = candidate_figures([FrameOutcome(labels, (), judge(reverse, outputs[:2], labels))], 0.5)
+    assert ranked["far_30"]["candidates"] == 2, "only those that the classifier saw are judged"
+    recall = ranked["proposal_recall"]["ego"]
     assert recall["labels"] == 2
     assert recall["found"][:4] == [0, 0, 1, 1]  # the third of the reversed list is the first true one
     assert recall["recall_16"] == 0.5

@@ -17,11 +17,12 @@ from click.testing import CliRunner
 from lanestream.engine import load_engine
 from lanestream.errors import LabelError
 from lanestream.road.view import Image
+from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame
-from lanestream_exporter.datasets.splits import LabelledClip
+from lanestream_exporter.datasets.manifest import LabelledClip
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
 from lanestream_exporter.evaluation.boundaries import match_ego
-from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, Material, evaluate
+from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, ServedModel
 from lanestream_exporter.evaluation.report import write_report
 from lanestream_exporter.evaluation.tables import tables
@@ -80,14 +81,14 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> LabelledClip:
     made = sample_clip(rng, 320, 180, frames=8, fps=25.0, drive=Drive("highway", fair=True))
     video, labels = folder / "road.mp4", folder / "road.jsonl"
     write_clip(made, video, labels)
-    return LabelledClip("road", video, labels, range(1000), WHOLE)
+    return LabelledClip("road", video, read_clip_labels(labels, WHOLE), range(1000))
 
 
 @pytest.fixture(scope="module")
 def evaluation(clip: LabelledClip) -> Evaluation:
     frames = [still(seed) for seed in range(24, 28)]
     methods = [ServedModel(load_engine(provider="cpu")), *map(Baseline, BASELINES)]
-    return evaluate(methods, Material("rendered", lambda: iter(frames), (clip,)))
+    return run_evaluation(methods, EvaluationSet("rendered", lambda: iter(frames), (clip,)))
 
 
 @pytest.fixture(scope="module")
@@ -186,8 +187,8 @@ def test_the_tables_name_every_method_and_drive(figures: dict[str, Any]) -> None
 
 
 def test_a_dataset_without_labels_is_an_error() -> None:
-    with pytest.raises(LabelError, match="nothing is labelled in empty"):
-        evaluate([Baseline(HoughLinesBaseline())], Material("empty", lambda: ()))
+    with pytest.raises(LabelError, match="empty has no labeled frames"):
+        run_evaluation([Baseline(HoughLinesBaseline())], EvaluationSet("empty", lambda: iter(())))
 
 
 def test_the_command_evaluates_own_frames(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lanestream.detection.patches import PatchGeometry
 from lanestream.errors import CheckpointError
-from lanestream_exporter.alexnet import AlexNet, Shape, initialise
+from lanestream.road.crops import PatchGeometry
+from lanestream_exporter.alexnet import AlexNet, Shape, load_torchvision_weights
 from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
 from lanestream_exporter.exporting.classifier import ExportableClassifier
-from lanestream_exporter.training.checkpoints import read_checkpoint
+from lanestream_exporter.training.run_files import read_checkpoint
 
 Weights = dict[str, Tensor]
 
@@ -25,7 +25,7 @@ FOREIGN = ForeignNetwork(("false", "lane"), PatchGeometry(224, half_width=0.4))
 def foreign_weights() -> Weights:
     """Returns weights as torchvision saves them, fine-tuned to two classes."""
     torch.manual_seed(0)
-    return AlexNet(normalised=False).state_dict()
+    return AlexNet(batch_norm=False).state_dict()
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_invalid_checkpoints_are_rejected(tmp_path: Path) -> None:
         with pytest.raises(CheckpointError):
             read_checkpoint(path)
         with pytest.raises(CheckpointError):
-            initialise(AlexNet(), path)
+            load_torchvision_weights(AlexNet(), path)
         for foreign in (None, FOREIGN):
             with pytest.raises(CheckpointError) as caught:
                 read_network(path, foreign)
@@ -57,10 +57,10 @@ def test_invalid_checkpoints_are_rejected(tmp_path: Path) -> None:
 
 def test_torchvision_weights_initialize_the_network(tmp_path: Path) -> None:
     path = tmp_path / "alexnet.pt"
-    source = AlexNet(1000, normalised=False)
+    source = AlexNet(1000, batch_norm=False)
     torch.save(source.state_dict(), path)
     network = AlexNet()
-    initialise(network, path)
+    load_torchvision_weights(network, path)
     assert torch.equal(network.features[3].weight, source.features[3].weight)  # type: ignore[arg-type, union-attr]
     assert network.classes == 2
 
@@ -105,7 +105,7 @@ def test_a_foreign_network_needs_only_classes_and_patches(saved: Any, foreign_we
     assert isinstance(exportable, ExportableClassifier)
     assert (exportable.normalization, exportable.patch_geometry.half_width) == ("imagenet", 0.4)
     x = torch.randn(1, 3, 224, 224, generator=torch.Generator().manual_seed(1))
-    network = AlexNet(normalised=False).eval()
+    network = AlexNet(batch_norm=False).eval()
     network.load_state_dict(foreign_weights)
     with torch.inference_mode():
         assert torch.equal(exportable.network(x), network(x))

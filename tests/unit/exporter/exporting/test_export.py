@@ -12,12 +12,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from lanestream.detection.patches import PatchGeometry
 from lanestream.engine import load_engine
 from lanestream.errors import ExportError, ModelError
-from lanestream.inference import ClassifierInfo, OnnxModel, RegressorInfo
-from lanestream.inference.model_info import METADATA_KEY
-from lanestream_exporter.alexnet import AlexNet, Shape, normalise
+from lanestream.inference.model_info import METADATA_KEY, ClassifierInfo, RegressorInfo
+from lanestream.inference.onnx_model import load
+from lanestream.road.crops import PatchGeometry
+from lanestream_exporter.alexnet import AlexNet, Shape, normalize
 from lanestream_exporter.exporting import export
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.compression import in_batches
@@ -32,7 +32,7 @@ from lanestream_exporter.exporting.exportable import (
 from lanestream_exporter.exporting.frames import ExportFrames
 from lanestream_exporter.exporting.graph import describe, write_graph
 from lanestream_exporter.exporting.regressor import ExportableRegressor
-from lanestream_exporter.regressor import Answer, LaneRegressor
+from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction
 
 SOURCE = ExportFrames(None, rendered=4)
 PROVENANCE = Provenance({"data": "none", "step": 7}, SOURCE)
@@ -63,10 +63,10 @@ def exported(exportable: ExportableNetwork, precision: Precision, folder: Path) 
 @pytest.fixture(scope="module")
 def classifier(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     torch.manual_seed(0)
-    network = AlexNet(shape=Shape(112, 0.5, 512), normalised=False).eval()
+    network = AlexNet(shape=Shape(112, 0.5, 512), batch_norm=False).eval()
     exportable = ExportableClassifier(network, patch_geometry=PatchGeometry(112))
     # A fresh AlexNet gives nearly the same output for every patch, so its small differences are amplified.
-    logits = in_batches(lambda part: network(normalise(part)), exportable.training_inputs(SOURCE))
+    logits = in_batches(lambda part: network(normalize(part)), exportable.training_inputs(SOURCE))
     last = network.classifier[6]
     assert isinstance(last, torch.nn.Linear)
     with torch.no_grad():
@@ -83,7 +83,7 @@ def regressor(tmp_path_factory: pytest.TempPathFactory) -> Exported:
 
 
 def test_the_classifier_file_matches_pytorch_at_any_batch_size(classifier: Exported) -> None:
-    model = OnnxModel.load(classifier.path, "cpu")
+    model = load(classifier.path)
     inputs = classifier.validation.inputs[:20]
     expected = in_batches(classifier.report.network.serving_module(), inputs).numpy()
     assert expected[:, 1].std() > 0.02
@@ -117,31 +117,28 @@ def test_the_regressor_file_matches_pytorch(regressor: Exported) -> None:
     assert isinstance(exportable, ExportableRegressor)
     inputs = regressor.validation.inputs
     with torch.inference_mode():
-        answer = Answer.of(exportable.network(normalise(torch.from_numpy(inputs))))
-    expected = replace(answer, presence=answer.presence / exportable.calibration.temperature).told().numpy()
-    np.testing.assert_allclose(OnnxModel.load(regressor.path, "cpu").run(inputs), expected, atol=1e-4)
+        answer = RegressorPrediction.of(exportable.network(normalize(torch.from_numpy(inputs))))
+    expected = replace(answer, presence=answer.presence / exportable.calibration.temperature).served().numpy()
+    np.testing.assert_allclose(load(regressor.path).run(inputs), expected, atol=1e-4)
     assert regressor.report.written is regressor.report.fp32
     assert regressor.report.time_ratio is None
 
 
 def test_the_regressors_metrics_use_what_its_detector_reads(regressor: Exported) -> None:
     validation, exportable = regressor.validation, regressor.report.network
-    assert len(validation.prepared) == 2 * validation.frames
-    assert {len(values) for values in validation.truth.values()} == {len(validation.prepared)}
-    good = replace(
-        validation, truth={**validation.truth, "columns": exportable._read(_outputs(regressor), validation)[0]}
-    )  # type: ignore[attr-defined]
-    metrics = exportable.metrics(_outputs(regressor), good)
+    assert isinstance(exportable, ExportableRegressor)
+    assert len(validation.images) == len(validation.contexts) == 2 * validation.frames
+    assert {len(values) for values in validation.truth.values()} == {len(validation.images)}
+    assert len(validation.inputs) == (2 + 7) * validation.frames  # an unknown horizon takes five more crops
+    run = load(regressor.path).run
+    good = replace(validation, truth={**validation.truth, "columns": exportable._read(run, validation)[0]})
+    metrics = exportable.metrics(run, good)
     assert metrics["accuracy"] == 1.0
     assert metrics["error_near_px"] == metrics["error_far_px"] == 0.0
     off = replace(good, truth={**good.truth, "columns": good.truth["columns"] + 0.01})
-    metrics = exportable.metrics(_outputs(regressor), off)
+    metrics = exportable.metrics(run, off)
     assert metrics["accuracy"] == 0.0
     assert metrics["error_near_px"] == pytest.approx(6.4)
-
-
-def _outputs(made: Exported) -> NDArray[np.float32]:
-    return OnnxModel.load(made.path, "cpu").run(made.validation.inputs)
 
 
 def test_the_regressors_small_layers_stay_in_fp32_in_an_int8_file(regressor: Exported, tmp_path: Path) -> None:
@@ -150,36 +147,37 @@ def test_the_regressors_small_layers_stay_in_fp32_in_an_int8_file(regressor: Exp
     export.quantize(regressor.path, small, regressor.validation.inputs, exportable.fp32_layers)
     weights = {tensor.name: tensor.data_type for tensor in onnx.load(str(small)).graph.initializer}
     floats = [name for name, kind in weights.items() if kind == onnx.TensorProto.FLOAT and name.endswith("weight")]
-    assert {name.split(".")[1] for name in floats} == {"features", "hidden", "shape", "doubts"}
+    assert {name.split(".")[1] for name in floats} == {"features", "hidden", "column_head", "auxiliary_head"}
     assert [name for name in floats if ".features." in name] == ["network.features.0.weight"]
-    info = OnnxModel.load(regressor.path, "cpu").info
+    info = load(regressor.path).info
     describe(small, info)
     expected = in_batches(exportable.serving_module(), regressor.validation.inputs).numpy()
-    assert np.abs(OnnxModel.load(small, "cpu").run(regressor.validation.inputs) - expected).mean() < 0.01
+    assert np.abs(load(small).run(regressor.validation.inputs) - expected).mean() < 0.01
 
 
 def test_both_files_run_in_their_detectors(classifier: Exported, regressor: Exported) -> None:
     for made in (classifier, regressor):
         engine = load_engine(made.path, "cpu", regressor=None)
-        prepared = made.validation.prepared[0]
-        findings = engine.detector.finish(prepared, engine.network.run(prepared.inputs))
-        assert findings.view.width == prepared.view.width
-        assert type(engine.detector) is type(made.report.network.detector)
+        detector = engine.detectors[engine.select()]
+        image, run = made.validation.images[0], engine.main_model().run
+        found = detector.detect(image, made.validation.contexts[0], made.report.network.infer(run))
+        assert (found.view.width, found.view.height) == (image.shape[1], image.shape[0])
+        assert type(detector) is type(made.report.network.detector)
 
 
 def test_the_files_describe_themselves(classifier: Exported, regressor: Exported) -> None:
-    info = OnnxModel.load(classifier.path, "cpu").info
+    info = load(classifier.path).info
     assert isinstance(info, ClassifierInfo)
-    assert (info.precision, info.classes, info.strip.size) == ("int8", ("false", "lane"), 112)
+    assert (info.precision, info.classes, info.patch.size) == ("int8", ("false", "lane"), 112)
     assert info.training == {
         "data": "none", "step": 7, "rank_energy": 0.9, "export_frames": "rendered scenes", "normalization": "contrast",
     }  # fmt: skip
     assert info.metrics["frame_count"] == 4
     assert info.metrics["accuracy"] == pytest.approx(classifier.report.written.metrics["accuracy"], abs=1e-4)
     assert info.threshold == classifier.report.network.calibration.threshold
-    other = OnnxModel.load(regressor.path, "cpu").info
+    other = load(regressor.path).info
     assert isinstance(other, RegressorInfo)
-    assert (other.canvas.size, other.canvas.detail_width, other.precision) == (160, 448, "fp32")
+    assert (other.road_crop.size, other.road_crop.detail_width, other.precision) == (160, 448, "fp32")
     assert "onnxruntime" in other.exporter
 
 
@@ -196,7 +194,7 @@ def test_half_precision_loads_on_the_cpu_and_agrees(classifier: Exported, tmp_pa
     assert graph.output[0].type.tensor_type.elem_type == onnx.TensorProto.FLOAT
     inputs = classifier.validation.inputs[:8]
     expected = in_batches(exportable.serving_module(), inputs).numpy()
-    np.testing.assert_allclose(OnnxModel.load(path, "cpu").run(inputs), expected, atol=0.02)
+    np.testing.assert_allclose(load(path).run(inputs), expected, atol=0.02)
 
 
 def test_a_file_that_differs_is_not_written(
@@ -277,7 +275,7 @@ def test_invalid_model_files_are_rejected_in_one_line(classifier: Exported, tmp_
         (strange, "kind"),
     ):
         with pytest.raises(ModelError, match=message) as caught:
-            OnnxModel.load(path, "cpu")
+            load(path)
         assert "\n" not in str(caught.value)
         assert caught.value.hint
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from click import UsageError
 from click.testing import CliRunner, Result
+from labelfiles import write_manifest
 
-from lanestream.detection import Prepared
-from lanestream.detection.patches import PatchGeometry
 from lanestream.engine import SHIPPED_REGRESSOR
 from lanestream.errors import CheckpointError, ExportError, ModelError
+from lanestream.road.crops import PatchGeometry
 from lanestream_exporter import export_commands
 from lanestream_exporter.alexnet import AlexNet, Shape
 from lanestream_exporter.exporting.classifier import ExportableClassifier
@@ -47,8 +48,8 @@ def test_invalid_patch_geometries_are_rejected(tmp_path: Path, patch: str, messa
 
 def test_a_patch_geometry_names_only_what_differs_from_the_defaults() -> None:
     command = export_commands.export
-    with command.make_context("export", ["a.pt", "b.onnx", "--patch", "half_width=0.4, lean=0"]) as context:
-        assert context.params["patch"] == PatchGeometry(224, half_width=0.4, lean=0.0)
+    with command.make_context("export", ["a.pt", "b.onnx", "--patch", "half_width=0.4, obliquity=0"]) as context:
+        assert context.params["patch"] == PatchGeometry(224, half_width=0.4, obliquity=0.0)
 
 
 def test_classes_and_patch_geometry_must_be_given_together(tmp_path: Path) -> None:
@@ -73,15 +74,10 @@ def test_a_classifier_is_verified_with_the_regressor_that_it_is_served_with() ->
     frames = ExportFrames(None, rendered=4)
     network = ExportableClassifier(AlexNet(shape=SMALL), patch_geometry=PatchGeometry(SMALL.size))
     networks = [export_commands._with_prior(network, path) for path in (SHIPPED_REGRESSOR, None, Path("none"))]
-    served, shipped, alone = ([bottoms(p) for p in each.validation_set(frames).prepared] for each in networks)
-    assert served == shipped
-    assert served != alone
-    assert alone == [bottoms(prepared) for prepared in network.validation_set(frames).prepared]
-
-
-def bottoms(prepared: Prepared) -> list[float]:
-    """Returns the columns where the candidates cross the bottom row."""
-    return [round(float(candidate.curve.x(prepared.view.bottom)), 1) for candidate in prepared.candidates]
+    served, shipped, alone = (each.validation_set(frames).inputs for each in networks)
+    np.testing.assert_array_equal(served, shipped)
+    assert not np.array_equal(served, alone)
+    np.testing.assert_array_equal(alone, network.validation_set(frames).inputs)
 
 
 def test_only_classifiers_take_a_regressor(tmp_path: Path) -> None:
@@ -98,7 +94,7 @@ def test_the_table_compares_size_accuracy_and_time(tmp_path: Path, capsys: pytes
         ModelMeasurement("int8", {"accuracy": 0.947, "average_precision": 0.98}, 1e-3, 5e-2, 3_000_000, 1.2),
     ]
     with torch.device("meta"):
-        network = ExportableClassifier(AlexNet(normalised=False))
+        network = ExportableClassifier(AlexNet(batch_norm=False))
     report = ExportReport(network, 20, 300, *rows, BoundaryComparison(80, 1, 0.1, 2.5), "openvino")
     out = tmp_path / "out.onnx"
     out.write_bytes(bytes(1234))  # the metrics are written into the file after it has been measured
@@ -115,10 +111,13 @@ def test_the_table_compares_size_accuracy_and_time(tmp_path: Path, capsys: pytes
 
 
 def test_own_frames_verify_the_file_if_they_still_exist(tmp_path: Path) -> None:
-    data = {"train": [{"path": str(tmp_path), "format": "auto"}], "validation": [], "validation_share": 0.25}
-    found = export_commands._own_frames({"config": {"data": data}})
+    manifest = write_manifest(tmp_path / "datasets.toml", {"name": "mine", "path": "roads", "split": "train"})
+    found = export_commands._datasets({"config": {"data": {"manifest": str(manifest)}}}, tmp_path)
     assert found is not None
-    assert (found.train[0].path, found.validation_share) == (str(tmp_path), 0.25)
-    data["train"] = [{"path": str(tmp_path / "gone"), "format": "auto"}]
-    assert export_commands._own_frames({"config": {"data": data}}) is None
-    assert export_commands._own_frames({"data": "not recorded"}) is None
+    assert (found.manifest.dataset[0].name, found.root) == ("mine", tmp_path)
+    gone = {"config": {"data": {"manifest": str(tmp_path / "gone.toml")}}}
+    assert export_commands._datasets(gone, None) is None
+    assert export_commands._datasets({"data": "not recorded"}, None) is None
+    shipped = export_commands._datasets({"data": "not recorded"}, tmp_path)
+    assert shipped is not None
+    assert shipped.root == tmp_path

@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from lanestream.detection import Prepared
+from lanestream.detection.ego_prior import RoadRegressor
+from lanestream.detection.interface import FrameContext, Infer, ModelRole
 from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.errors import ExportError
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection
-from lanestream.road.view import RoadView
-from lanestream_exporter.alexnet import AlexNet, normalise
+from lanestream_exporter.alexnet import AlexNet, normalize
 from lanestream_exporter.exporting import proof
 from lanestream_exporter.exporting.compression import truncate_layers
 from lanestream_exporter.exporting.exportable import Calibration, ValidationSet, fit_calibration
@@ -50,13 +50,13 @@ def network() -> AlexNet:
 @torch.inference_mode()
 def test_folding_keeps_the_function_and_removes_the_normalization(network: AlexNet, patches: NDArray[np.uint8]) -> None:
     plain = network.folded()
-    x = normalise(torch.from_numpy(patches[:4]))
+    x = normalize(torch.from_numpy(patches[:4]))
     torch.testing.assert_close(plain(x), network(x), rtol=1e-3, atol=1e-4)
     assert not [key for key in plain.state_dict() if key.startswith("norms.")]
 
 
 def test_the_plain_network_has_torchvisions_keys_and_shapes() -> None:
-    shapes = {key: tuple(value.shape) for key, value in AlexNet(1000, normalised=False).state_dict().items()}
+    shapes = {key: tuple(value.shape) for key, value in AlexNet(1000, batch_norm=False).state_dict().items()}
     assert shapes["features.0.weight"] == (64, 3, 11, 11)
     assert shapes["features.10.weight"] == (256, 256, 3, 3)
     assert shapes["classifier.1.weight"] == (4096, 9216)
@@ -102,13 +102,13 @@ def test_truncation_keeps_layers_that_it_would_not_shrink(layers: nn.Sequential)
 @torch.inference_mode()
 def test_brightness_and_contrast_of_a_patch_are_normalized_away(patches: NDArray[np.uint8]) -> None:
     dim = (patches[:2].astype(np.float32) * 0.5 + 20.0).astype(np.uint8)
-    difference = normalise(torch.from_numpy(dim)) - normalise(torch.from_numpy(patches[:2]))
+    difference = normalize(torch.from_numpy(dim)) - normalize(torch.from_numpy(patches[:2]))
     assert difference.abs().mean().item() < 0.1
 
 
 def test_the_served_normalization_matches_training(patches: NDArray[np.uint8]) -> None:
     images = torch.from_numpy(np.concatenate([patches[:6], patches[:2] // 50, np.full_like(patches[:1], 77)]))
-    torch.testing.assert_close(contrast(images), normalise(images), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(contrast(images), normalize(images), rtol=1e-4, atol=1e-5)
 
 
 def test_the_imagenet_normalization_matches_torchvision() -> None:
@@ -135,20 +135,29 @@ def test_equal_labels_give_the_default_calibration() -> None:
 
 
 def test_boundaries_of_two_networks_are_compared_by_columns() -> None:
-    view = RoadView(640, 360, 160.0)
-    inputs = np.zeros((2, 224, 224, 3), np.uint8)
-    prepared = Prepared(np.zeros((360, 640, 3), np.uint8), (lambda: inputs,), view, looks=(view,))
-    validation = ValidationSet(2, (prepared, prepared), {})
+    image, inputs = np.zeros((360, 640, 3), np.uint8), np.zeros((2, 224, 224, 3), np.uint8)
+    validation = ValidationSet(2, (image, image), (FrameContext(160.0),) * 2, inputs, {})
+    detector = RegressionDetector(RoadRegressor(0.5))
     straight = [-0.3, -0.12, -0.05, 0.3, 0.12, 0.05, *[0.01] * 6, 0.9, 0.9, 0.0]
     both = np.array([straight, straight], np.float32)  # straight and mirrored views, which are equal here
     single = both.copy()
     single[0, 13] = single[1, 12] = 0.0
-    same, other = (np.concatenate([both, part]) for part in (both, single))
-    found = compare_boundaries(RegressionDetector(), validation, same, other)
+    found = compare_boundaries(detector, validation, returning(both, both), returning(both, single))
     assert (found.matched, found.unmatched) == (3, 1)
     assert 0.0 < found.mean < found.largest  # a boundary fitted alone differs from one fitted jointly
-    equal = compare_boundaries(RegressionDetector(), validation, same, same)
+    equal = compare_boundaries(detector, validation, returning(both, both), returning(both, both))
     assert (equal.matched, equal.unmatched, equal.mean, equal.largest) == (4, 0, 0.0, 0.0)
+
+
+def returning(*outputs: NDArray[np.float32]) -> Infer:
+    """Returns a network with these outputs, one after the other."""
+    remaining = iter(outputs)
+
+    def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        assert (role, len(inputs)) == ("regressor", 2)
+        return next(remaining)
+
+    return infer
 
 
 def test_only_close_boundaries_are_matched() -> None:

@@ -1,4 +1,4 @@
-"""The loop that networks learn in: seeded, resumable, refusing what does not fit; its configuration and its average."""
+"""The training loop is seeded and resumable and refuses mismatches; recipes and the moving average."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lanestream.errors import CheckpointError, SettingsError
-from lanestream_exporter.training.average import WeightAverage
-from lanestream_exporter.training.checkpoints import read_checkpoint, write_checkpoint
+from lanestream_exporter.toml_files import CONFIG_FOLDER
 from lanestream_exporter.training.classifier import starting_network
 from lanestream_exporter.training.config import (
-    SHIPPED,
     AdamW,
     ClassifierConfig,
     Cosine,
     NetworkSize,
+    RegressorConfig,
     Sgd,
     Staircase,
     TrainConfig,
     read_config,
 )
-from lanestream_exporter.training.loop import Batch, Progress, Run, rate_at
-from lanestream_exporter.training.regressor import RegressorConfig, starting_regressor
+from lanestream_exporter.training.loop import Batch, Run, TrainingProgress, averaged_model, rate_at
+from lanestream_exporter.training.regressor import starting_regressor
+from lanestream_exporter.training.run_files import read_checkpoint, write_checkpoint
 
 
 class Parity:
-    """Tells whether two signs agree, by a small network with dropout and batch normalisation."""
+    """Learns whether two signs agree, with a small network with dropout and batch normalization."""
 
     def __init__(self) -> None:
         torch.manual_seed(0)
@@ -50,14 +50,14 @@ class Parity:
 
 
 CONFIG = TrainConfig(
-    steps=60, check_every=20, ema=0.9, clip=0.0, optimiser=AdamW(learning_rate=0.05), schedule=Cosine(warm_up=5)
+    steps=60, check_every=20, ema=0.9, clip=0.0, optimizer=AdamW(learning_rate=0.05), schedule=Cosine(warm_up=5)
 )
 
 
-def trained(folder: Path, config: TrainConfig = CONFIG, stop_at: int | None = None) -> list[Progress]:
-    told: list[Progress] = []
-    Run(Parity(), config, folder).go(told.append, lambda: told[-1].step == stop_at)
-    return told
+def trained(folder: Path, config: TrainConfig = CONFIG, stop_at: int | None = None) -> list[TrainingProgress]:
+    reports: list[TrainingProgress] = []
+    Run(Parity(), config, folder).train(reports.append, lambda: reports[-1].step == stop_at)
+    return reports
 
 
 def weights(path: Path) -> dict[str, Tensor]:
@@ -66,7 +66,7 @@ def weights(path: Path) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("stop_at", [7, 20, 59])
-def test_a_run_that_was_stopped_and_goes_on_is_the_same_run(tmp_path: Path, stop_at: int) -> None:
+def test_a_resumed_run_gives_the_same_result(tmp_path: Path, stop_at: int) -> None:
     whole = trained(tmp_path / "whole")
     first = trained(tmp_path / "parts", stop_at=stop_at)
     second = trained(tmp_path / "parts")
@@ -79,9 +79,9 @@ def test_a_run_that_was_stopped_and_goes_on_is_the_same_run(tmp_path: Path, stop
     assert (tmp_path / "parts" / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_it_learns_and_keeps_the_best_with_what_made_it(tmp_path: Path) -> None:
-    told = trained(tmp_path)
-    checks = [p.figures["validation"] for p in told if p.figures]
+def test_it_learns_and_keeps_the_best_network_with_its_record(tmp_path: Path) -> None:
+    reports = trained(tmp_path)
+    checks = [p.figures["validation"] for p in reports if p.figures]
     assert len(checks) == 3
     assert min(checks) < 0.4 < checks[0] + 0.3
     best = read_checkpoint(tmp_path / "best.pt")
@@ -98,7 +98,7 @@ def test_a_finished_run_does_nothing_more(tmp_path: Path) -> None:
     assert (tmp_path / "best.pt").read_bytes() == before
 
 
-def test_a_run_of_another_configuration_or_other_data_is_refused(tmp_path: Path) -> None:
+def test_a_run_with_another_configuration_or_data_is_refused(tmp_path: Path) -> None:
     trained(tmp_path, stop_at=5)
     with pytest.raises(SettingsError, match="another config: seed was 1"):
         trained(tmp_path, CONFIG.model_copy(update={"seed": 2}))
@@ -108,81 +108,92 @@ def test_a_run_of_another_configuration_or_other_data_is_refused(tmp_path: Path)
         Run(task, CONFIG, tmp_path)
 
 
-def test_a_broken_checkpoint_is_named(tmp_path: Path) -> None:
+def test_a_broken_checkpoint_is_reported(tmp_path: Path) -> None:
     (tmp_path / "last.pt").write_text("half a file")
     with pytest.raises(CheckpointError, match=r"last\.pt"):
         Run(Parity(), CONFIG, tmp_path)
 
 
-def test_a_run_that_blows_up_says_so(tmp_path: Path) -> None:
-    config = TrainConfig(steps=50, clip=0.0, optimiser=Sgd(kind="sgd", learning_rate=1e30))
+def test_a_diverging_run_is_reported(tmp_path: Path) -> None:
+    config = TrainConfig(steps=50, clip=0.0, optimizer=Sgd(kind="sgd", learning_rate=1e30))
     with pytest.raises(SettingsError, match="lower the learning rate"):
         trained(tmp_path, config)
 
 
-def test_the_average_follows_the_weights_and_forgets_the_first_ones() -> None:
+def test_the_average_follows_the_weights_and_forgets_the_initial_ones() -> None:
     network = nn.BatchNorm1d(1)
-    average = WeightAverage(network, 0.9)
+    average = averaged_model(network, 0.9)
     values = []
     for step in range(200):
         with torch.no_grad():
             network.weight.fill_(5.0 if step < 100 else 7.0)
             assert network.running_mean is not None
             network.running_mean.fill_(3.0)
-        average.update(network)
-        values.append(average.network.state_dict()["weight"].item())
-    assert values[9] == pytest.approx(5.0, abs=0.05)  # it began at 1
+        average.update_parameters(network)
+        values.append(average.module.state_dict()["weight"].item())
+    assert values[9] == pytest.approx(5.0, abs=0.05)  # the initial weight is 1
     assert values[109] == pytest.approx(7.0 - 2.0 * 0.9**10, abs=0.01)
-    assert average.network.state_dict()["running_mean"].item() == pytest.approx(3.0, abs=1e-3)
-    assert not any(parameter.requires_grad for parameter in average.network.parameters())
+    assert average.module.state_dict()["running_mean"].item() == pytest.approx(3.0, abs=1e-3)
+    assert not any(parameter.requires_grad for parameter in average.module.parameters())
 
 
 def test_schedules() -> None:
-    cosine = TrainConfig(steps=1000, optimiser=AdamW(learning_rate=3e-4), schedule=Cosine(warm_up=100))
+    cosine = TrainConfig(steps=1000, optimizer=AdamW(learning_rate=3e-4), schedule=Cosine(warm_up=100))
     assert rate_at(cosine, 49) == pytest.approx(1.5e-4, rel=0.01)
     assert rate_at(cosine, 500) == pytest.approx(1.5e-4)
     assert rate_at(cosine, 999) < 1e-8
-    stairs = TrainConfig(optimiser=Sgd(kind="sgd"), schedule=Staircase(kind="staircase", every=10))
+    stairs = TrainConfig(optimizer=Sgd(kind="sgd"), schedule=Staircase(kind="staircase", every=10))
     assert [rate_at(stairs, step) for step in (9, 10, 20)] == pytest.approx([1e-3, 1e-4, 1e-5])
 
 
-def test_the_shipped_configurations_are_read() -> None:
+def test_the_shipped_recipes_are_read() -> None:
     assert read_config(Path("classifier"), ClassifierConfig) == ClassifierConfig()
     regressor = read_config(Path("regressor"), RegressorConfig)
     assert regressor.model_copy(update={"initial": None}) == RegressorConfig()
     second = read_config(Path("regressor-second"), RegressorConfig)
     assert (second.initial, second.steps) == ("runs/regressor/best.pt", regressor.steps)
     assert read_config(Path("classifier-second"), ClassifierConfig).initial == "runs/classifier/best.pt"
-    published = read_config(SHIPPED / "classifier-published.toml", ClassifierConfig)
-    assert published.optimiser == Sgd(kind="sgd", learning_rate=0.001, momentum=0.9, weight_decay=1e-4)
+    third = read_config(Path("classifier-third"), ClassifierConfig)
+    assert (third.data.regressor, third.data.propagation_stride) == ("out/regressor.onnx", 5)
+    toy = read_config(Path("classifier-toy"), ClassifierConfig)
+    assert (toy.data.propagation_stride, toy.data.manifest) == (0, None)
+    published = read_config(CONFIG_FOLDER / "classifier-published.toml", ClassifierConfig)
+    assert published.optimizer == Sgd(kind="sgd", learning_rate=0.001, momentum=0.9, weight_decay=1e-4)
     assert published.batch == 15
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "expected"),
     [
-        ("stepps = 3", "there is no stepps (accepted here: seed, steps, batch"),
+        ("stepps = 3", "unknown key stepps (accepted here: seed, steps, batch"),
         ("steps = 0", "steps = 0 is not accepted (Input should be greater than 0)"),
-        ('[optimiser]\nkind = "adamw"\nmomentum = 0.9', "no optimiser.momentum (accepted here: kind, learning_rate, w"),
-        ('[optimiser]\nkind = "lion"', "optimiser = {'kind': 'lion'} is not accepted"),
-        ("[optimiser]\nlearning_rate = 3e-4", "optimiser = {'learning_rate': 0.0003} is not accepted"),
+        (
+            '[optimizer]\nkind = "adamw"\nmomentum = 0.9',
+            "unknown key optimizer.momentum (accepted here: kind, learning_rate, w",
+        ),
+        ('[optimizer]\nkind = "lion"', "optimizer = {'kind': 'lion'} is not accepted"),
+        ("[optimizer]\nlearning_rate = 3e-4", "optimizer = {'learning_rate': 0.0003} is not accepted"),
         ("[data]\nrendered_scenes = 0", "data: without rendered scenes real_share and final_real_share must be 1"),
+        (
+            '[data]\nmanifest = "a.toml"\nreal_share = 0\nfinal_real_share = 0',
+            "with a manifest real_share or final_real",
+        ),
         ("data = 3", "data = 3 is not accepted"),
         ("steps", "is not a TOML file"),
     ],
 )
-def test_a_bad_configuration_costs_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_a_bad_recipe_is_reported_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(SettingsError) as raised:
         read_config(path, ClassifierConfig)
     message = str(raised.value)
     assert message.startswith(str(path))
-    assert words in message
+    assert expected in message
     assert "\n" not in message
 
 
-def test_a_regressor_starts_from_the_convolutions_of_its_own_width_alone(tmp_path: Path) -> None:
+def test_a_regressor_only_starts_from_convolutions_of_its_own_width(tmp_path: Path) -> None:
     def saved(width: float) -> str:
         size = NetworkSize(size=63, width=width, hidden=8)
         path = tmp_path / f"{width}.pt"
@@ -197,5 +208,7 @@ def test_a_regressor_starts_from_the_convolutions_of_its_own_width_alone(tmp_pat
             assert torch.equal(network.state_dict()[key], value)
     write_checkpoint(tmp_path / "none.pt", {"network": 3})
     for other in (saved(0.2), str(tmp_path / "none.pt")):
-        with pytest.raises(CheckpointError, match=r"holds no convolutions of this network .*same \[network\] width"):
+        with pytest.raises(
+            CheckpointError, match=r"does not hold the convolutions of this network .*same \[network\] width"
+        ):
             starting_regressor(RegressorConfig(network=size, initial=other))

@@ -25,8 +25,8 @@ from lanestream.road.view import Image, RoadView
 from lanestream_exporter.alexnet import Shape
 from lanestream_exporter.datasets.horizons import shared_horizon
 from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
-from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss, logs_at_shares
-from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction, at_shares, lateral_loss, logs_at_shares
+from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, warped_road_crop
 from lanestream_exporter.samples.road_frames import RoadFrame, read_frames, write_frames
 
 WIDTH, HEIGHT, HORIZON = 640, 360, 150.0
@@ -216,15 +216,15 @@ def test_a_road_unlike_the_model_keeps_the_horizon_of_its_drive() -> None:
         Warp(pan=0.05),
         Warp(side=0.2),
         Warp(zoom=1.15),
-        Warp(bend=0.01),
+        Warp(curvature=0.01),
         Warp(assumed=0.1),
         Warp(flipped=True),
-        Warp(pan=-0.04, side=-0.15, zoom=0.9, bend=-0.01, assumed=-0.05, flipped=True),
+        Warp(pan=-0.04, side=-0.15, zoom=0.9, curvature=-0.01, assumed=-0.05, flipped=True),
     ],
 )
 def test_a_moved_frame_shows_its_paint_where_the_target_says(frame: RoadFrame, warp: Warp) -> None:
     geometry = RoadCropGeometry()
-    canvas, target = sample(frame, geometry, warp)
+    canvas, target = warped_road_crop(frame, geometry, warp)
     view = RoadView(frame.width, frame.height, frame.horizon)
     seen = RoadView(frame.width, frame.height, frame.horizon + warp.assumed * view.depth)
     grid_columns, grid_rows = geometry.grid(seen)
@@ -282,12 +282,12 @@ def test_the_loss_is_least_at_the_truth() -> None:
         "horizon": torch.zeros(4),
     }
     sure, certain = torch.full((4, 2, 3), -5.0), torch.full((4, 2), 8.0)
-    best = lateral_loss(Answer(columns, sure, certain, torch.zeros(4)), truth)
+    best = lateral_loss(RegressorPrediction(columns, sure, certain, torch.zeros(4)), truth)
     for worse in (
-        Answer(columns + 0.02, sure, certain, torch.zeros(4)),
-        Answer(columns, sure + 2.0, certain, torch.zeros(4)),
-        Answer(columns, sure, -certain, torch.zeros(4)),
-        Answer(columns, sure, certain, torch.full((4,), 0.1)),
+        RegressorPrediction(columns + 0.02, sure, certain, torch.zeros(4)),
+        RegressorPrediction(columns, sure + 2.0, certain, torch.zeros(4)),
+        RegressorPrediction(columns, sure, -certain, torch.zeros(4)),
+        RegressorPrediction(columns, sure, certain, torch.full((4,), 0.1)),
     ):
         assert lateral_loss(worse, truth) > best + 0.05
 
@@ -315,7 +315,7 @@ def test_folding_leaves_the_same_function() -> None:
             module for module in plain.modules() if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d)
         ]
         np.testing.assert_allclose(plain(canvases), network(canvases), rtol=1e-3, atol=1e-3)
-        assert Answer.of(plain(canvases)).told().shape == (2, OUTPUTS)
+        assert RegressorPrediction.of(plain(canvases)).served().shape == (2, OUTPUTS)
 
 
 def test_boundaries_are_moved_onto_the_paint_beneath_them() -> None:

@@ -1,4 +1,4 @@
-"""The pictures that labels belong to: image files, frames of videos, or bytes in the label file itself."""
+"""The images that labels belong to: image files, frames of videos, or bytes inside the label file."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from lanestream.images.decoding import MOST_PIXELS, ImageLimits, decode
 from lanestream.images.header import Header, read_header
 from lanestream.road.view import Image
 
-import cv2  # isort: skip  (imaging sets OpenCV's own limit before it is imported)
+import cv2  # isort: skip  (lanestream.images sets OpenCV's own limit before it is imported)
 import numpy as np  # isort: skip
 
-# More than a service accepts: labelled frames may come from any camera, and as PNG files.
+# More than the service accepts: labeled frames may come from any camera, and as PNG files.
 LIMITS: Final = ImageLimits(max_bytes=64 << 20, max_pixels=MOST_PIXELS // 2)
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Where a picture is: an image file, frame `index` of a video file, or `data`, the bytes of an image file."""
+class ImageLocation:
+    """Where an image is: an image file, frame `index` of a video file, or `data`, the bytes of an image file."""
 
     path: Path
     index: int | None = None
     data: bytes | None = field(default=None, repr=False)
 
 
-class Opener:
-    """Opens pictures one after another; frames of one video in order are decoded on, not from its start."""
+class ImageReader:
+    """Opens images one after another. Frames of one video in ascending order are decoded in a single pass."""
 
     def __init__(self) -> None:
         self._video: Path | None = None
         self._capture = cv2.VideoCapture()
-        self._read = 0  # frames of the video that have been passed
+        self._read = 0  # frames of the video read so far
 
     def __enter__(self) -> Self:
         return self
@@ -41,11 +41,11 @@ class Opener:
     def __exit__(self, *exception: object) -> None:
         self._capture.release()
 
-    def open(self, picture: Picture) -> Image:
-        """The picture as BGR (H, W, 3) uint8. Raises ImageError or SourceError where it can't be decoded."""
-        if picture.index is not None:
-            return self._frame(picture.path, picture.index)
-        return decode(picture.data if picture.data is not None else file_bytes(picture.path), LIMITS)
+    def open(self, location: ImageLocation) -> Image:
+        """Returns the image as BGR (H, W, 3) uint8. Raises ImageError or SourceError if it can't be decoded."""
+        if location.index is not None:
+            return self._frame(location.path, location.index)
+        return decode(location.data if location.data is not None else file_bytes(location.path), LIMITS)
 
     def _frame(self, video: Path, index: int) -> Image:
         if index < 0:
@@ -65,8 +65,19 @@ class Opener:
         return np.asarray(image, dtype=np.uint8)
 
 
+def video_size(video: Path) -> tuple[int, int]:
+    """Returns the (width, height) of a video's frames. Raises SourceError if it can't be read."""
+    capture = cv2.VideoCapture(str(video))
+    try:
+        if not capture.isOpened():
+            raise SourceError(f"{video} can't be read as a video", "give the path of a video file")
+        return int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    finally:
+        capture.release()
+
+
 def file_bytes(path: Path) -> bytes:
-    """What is in the image file `path`. Raises ImageError where it can't be read or is too large."""
+    """Returns the bytes of the image file `path`. Raises ImageError if it can't be read or is too large."""
     try:
         if path.stat().st_size > LIMITS.max_bytes:
             raise ImageError(f"{path.name} has more than {LIMITS.max_bytes:,} bytes", "save it smaller")
@@ -76,7 +87,7 @@ def file_bytes(path: Path) -> bytes:
 
 
 def checked_header(data: bytes) -> Header:
-    """What the image in `data` says of itself. Raises ImageError where it is none, or larger than is accepted."""
+    """Returns the header of the image in `data`. Raises ImageError if it is not an image or is too large."""
     header = read_header(data)
     if header.width * header.height > LIMITS.max_pixels:
         raise ImageError(f"the image is {header.width} x {header.height}: too large")

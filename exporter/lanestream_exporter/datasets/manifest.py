@@ -1,0 +1,248 @@
+"""The data set manifest: a TOML file that lists labeled data sets, how each is split and what its labels cover.
+
+`configs/datasets.toml` lists this project's own data sets and is the example to follow. Paths in a manifest count from
+the data folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import Field, model_validator
+
+from lanestream.errors import LabelError
+from lanestream_exporter.datasets.entries import LabelEntry
+from lanestream_exporter.datasets.files import DataFolder
+from lanestream_exporter.datasets.formats import AUTO, FORMATS
+from lanestream_exporter.datasets.images import ImageReader, video_size
+from lanestream_exporter.datasets.label_propagation import LabelPropagation
+from lanestream_exporter.datasets.labels import Coverage, LabelledFrame, LabelledImages
+from lanestream_exporter.datasets.reading import labelled_frame, open_entry, read_entries
+from lanestream_exporter.datasets.splits import (
+    GroupSplit,
+    Split,
+    SplitField,
+    WholeSplit,
+    clip_frames,
+    split_by_group,
+    split_of,
+)
+from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, read_toml
+
+SHIPPED_MANIFEST: Final = CONFIG_FOLDER / "datasets.toml"
+_SHIPPED_DATA: Final = Path("../shared/data")
+_SIDES: Final = {"left": -1, "right": 1}
+
+
+class CoverageSection(Section):
+    """What the labels cover, as `labels.Coverage` explains it. By default anything may have been left unlabeled."""
+
+    ego: bool = False
+    open_sides: tuple[Literal["left", "right"], ...] = ("left", "right")
+
+    @property
+    def coverage(self) -> Coverage:
+        """The same for labeled frames."""
+        return Coverage(self.ego, tuple(sorted(_SIDES[side] for side in self.open_sides)))
+
+
+class DatasetSpec(Section):
+    """One data set of a manifest: a folder or a label file, its split rule, and whom to credit for it."""
+
+    name: Annotated[str, Field(min_length=1)]
+    path: str
+    format: str = AUTO
+    split: SplitField
+    coverage: CoverageSection = CoverageSection()
+    license: str | None = None
+    credit: str | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.format != AUTO and self.format not in FORMATS:
+            raise ValueError(f"unknown label format {self.format!r}; accepted are {AUTO}, {', '.join(FORMATS)}")
+        return self
+
+    @property
+    def credit_record(self) -> dict[str, str]:
+        """Name, license and credit, as far as the manifest gives them."""
+        fields = {"name": self.name, "license": self.license, "credit": self.credit}
+        return {key: value for key, value in fields.items() if value is not None}
+
+
+class DatasetManifest(Section):
+    """All data sets of a manifest, in its order."""
+
+    dataset: Annotated[tuple[DatasetSpec, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names = [spec.name for spec in self.dataset]
+        repeated = next((name for name in names if names.count(name) > 1), None)
+        if repeated is not None:
+            raise ValueError(f"two data sets are named {repeated!r}; give each its own name")
+        return self
+
+
+@dataclass(frozen=True)
+class LabelledClip:
+    """A video with labeled frames, by index, and the stretch of its frames that belongs to a split."""
+
+    name: str
+    video: Path
+    labelled: dict[int, LabelledFrame]
+    frames: range
+
+
+@dataclass(frozen=True)
+class DatasetCollection:
+    """The data sets of a manifest in a data folder, with their frames by split."""
+
+    manifest: DatasetManifest
+    root: Path
+
+    @classmethod
+    def open(cls, manifest: Path | None = None, data: Path | None = None) -> DatasetCollection:
+        """Reads the manifest at a path, or the shipped one if it is None.
+
+        The data folder is `data`, else $LANESTREAM_DATA, else the folder of the manifest; of the shipped one
+        ../shared/data. Raises SettingsError for a bad manifest. Data sets are opened when they are read.
+        """
+        path = manifest or SHIPPED_MANIFEST
+        read = read_toml(path, DatasetManifest, "give a manifest of data sets, a TOML file")
+        named = data or os.environ.get("LANESTREAM_DATA")
+        default = _SHIPPED_DATA if manifest is None else path.parent
+        return cls(read, Path(named) if named else default)
+
+    @property
+    def any_present(self) -> bool:
+        """Whether the data folder holds at least one of the data sets."""
+        return any(map(self._is_present, self.manifest.dataset))
+
+    def frames(self, split: Split) -> LabelledImages:
+        """Yields the labeled frames of a split, one data set after another. Raises LabelError for a bad record."""
+        with ImageReader() as images:
+            for spec, entry in self._entries(split):
+                for sample in open_entry(entry, images, spec.coverage.coverage):
+                    if isinstance(sample, LabelError):
+                        raise sample
+                    yield sample.frame, sample.image
+
+    def training_frames(self, propagation: LabelPropagation | None) -> LabelledImages:
+        """Yields the frames of the training split, then those that `propagation` labels between them.
+
+        Raises LabelError for a bad record and SourceError for a video that can't be read.
+        """
+        yield from self.frames("train")
+        if propagation is not None:
+            for clip in self.clips("train"):
+                yield from propagation.frames(clip.video, clip.labelled)
+
+    def clips(self, split: Split) -> Iterator[LabelledClip]:
+        """Yields the videos that have labeled frames in a split. Raises LabelError for a bad record."""
+        for spec in self.manifest.dataset:
+            videos: dict[Path, dict[int, LabelledFrame]] = {}
+            for entry in self._entries_of(spec, split):
+                if entry.video is not None and entry.index is not None:
+                    size = entry.size or video_size(entry.video)
+                    frame, faults = labelled_frame(entry, size, spec.coverage.coverage)
+                    if faults:
+                        raise faults[0]
+                    videos.setdefault(entry.video, {})[entry.index] = frame
+            for video, labelled in videos.items():
+                name = next(iter(labelled.values())).group
+                yield LabelledClip(name, video, labelled, clip_frames(spec.split, split, list(labelled)))
+
+    def require_splits(self, *splits: Split) -> None:
+        """Raises LabelError if a split has no frames."""
+        for split in splits:
+            if not any(True for _ in self._entries(split)):
+                raise LabelError(
+                    f"the manifest puts no frames into the split {split!r}",
+                    'give a data set with frames for it; { by = "group", val = 0.2 } divides one by drive',
+                )
+
+    def credits(self) -> list[dict[str, str]]:
+        """Returns name, license and credit of every data set that training or validation may use."""
+        return [
+            spec.credit_record
+            for spec in self.manifest.dataset
+            if not (isinstance(spec.split, WholeSplit) and spec.split.split == "test")
+        ]
+
+    def fingerprint(self) -> str:
+        """Returns a hash that changes with the manifest and with the files of its data sets."""
+        digest = hashlib.sha256(self.manifest.model_dump_json().encode())
+        for spec in filter(self._is_present, self.manifest.dataset):
+            for file in DataFolder.at(self._path(spec)).files:
+                status = file.stat()
+                digest.update(f"{file} {status.st_size} {status.st_mtime_ns}\n".encode())
+        return digest.hexdigest()[:12]
+
+    def _entries(self, split: Split) -> Iterator[tuple[DatasetSpec, LabelEntry]]:
+        for spec in self.manifest.dataset:
+            for entry in self._entries_of(spec, split):
+                yield spec, entry
+
+    def _entries_of(self, spec: DatasetSpec, split: Split) -> Iterator[LabelEntry]:
+        if isinstance(spec.split, WholeSplit) and spec.split.split != split:
+            return iter(())  # such a data set may be missing
+        groups = self._validation_groups[spec.name]
+        return (entry for entry in self._read(spec) if split_of(spec.split, entry, groups) == split)
+
+    def _read(self, spec: DatasetSpec) -> Iterator[LabelEntry]:
+        """Yields the records of a data set without opening its images."""
+        for entry in read_entries(self._path(spec), spec.format):
+            if isinstance(entry, LabelError):
+                raise entry
+            yield entry
+
+    def _is_present(self, spec: DatasetSpec) -> bool:
+        return (self.root / spec.path).exists()
+
+    def _path(self, spec: DatasetSpec) -> Path:
+        path = self.root / spec.path
+        if not self._is_present(spec):
+            raise LabelError(
+                f"the data set {spec.name!r} is missing: there is nothing at {path}",
+                "give the folder that the manifest's paths count from with --data or LANESTREAM_DATA",
+            )
+        return path
+
+    @cached_property
+    def _validation_groups(self) -> dict[str, frozenset[str]]:
+        """The groups that each data set's GroupSplit chose to validate with, by the data set's name.
+
+        Raises LabelError if two data sets put the same drive or clip into different splits. Missing data sets are
+        skipped here; they are reported when their frames are read.
+        """
+        chosen: dict[str, frozenset[str]] = {spec.name: frozenset() for spec in self.manifest.dataset}
+        parts: dict[str, set[tuple[Split, str]]] = {}  # by group: the splits and data sets that it is in
+        for spec in filter(self._is_present, self.manifest.dataset):
+            if isinstance(spec.split, GroupSplit):
+                groups = (entry.group for entry in self._read(spec))
+                chosen[spec.name] = split_by_group(groups, spec.split.val, spec.split.seed).validation
+            for entry in self._read(spec):
+                split = split_of(spec.split, entry, chosen[spec.name])
+                if split is not None:
+                    parts.setdefault(entry.group, set()).add((split, spec.name))
+        for group, where in parts.items():
+            for (one, first), (other, second) in combinations(sorted(where), 2):
+                if one != other and first != second:
+                    raise LabelError(
+                        f"{group!r} is in {one} by {first!r} and in {other} by {second!r}",
+                        "put each drive or clip into one split only",
+                    )
+        return chosen
+
+
+def origin_of(collection: DatasetCollection | None, rendered_scenes: int) -> dict[str, Any]:
+    """Returns what a run records about where its frames came from; `collection` is None without labeled frames."""
+    return {"real_frames": [] if collection is None else collection.credits(), "rendered_scenes": rendered_scenes}
