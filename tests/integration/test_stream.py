@@ -342,5 +342,6 @@ def test_streams_do_not_affect_each_other(url: str) -> None:
             other.send(large)
             for socket, width, horizon in ((one, 320, 0.4 * 180), (other, 640, 0.3 * 360)):
                 answer = receive(socket)
-                assert (answer["seq"], answer["width"], answer["horizon"]) == (seq, width, horizon)
+                assert (answer["seq"], answer["width"]) == (seq, width)
+                assert answer["horizon"] == pytest.approx(horizon, abs=0.5), "half a pixel of a resized image"
                 assert [lane["track_id"] for lane in answer["lanes"]] == [1, 2]
