@@ -72,6 +72,6 @@ def test_an_invalid_description_is_an_error_of_one_line(info: dict[str, Any], wh
 
 
 def test_a_file_without_a_description_is_an_error() -> None:
-    with pytest.raises(ModelError, match="x.onnx does not describe itself: it has no 'lanestream' metadata") as error:
+    with pytest.raises(ModelError, match=r"x\.onnx does not describe itself: it has no 'lanestream' metadata") as error:
         parse_info({}, "x.onnx")
     assert "lanestream export" in error.value.hint
