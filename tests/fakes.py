@@ -1,88 +1,77 @@
-"""Stand-ins for what is slow or can't be steered: a detector that knows the road, networks that wait to be told."""
+"""Fakes of what is slow or cannot be controlled: a detector that knows the road, and models that wait for the test."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection import Detections, Pipeline, Prepared
+from lanestream.detection.interface import Detections, FrameContext, Infer, ModelRole
 from lanestream.engine import Engine
+from lanestream.inference.loaded_model import Placement
 from lanestream.protocol import EgoModel, LanesMessage, Limits, Mode, ReadyMessage, TimingModel
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_rows
 
-WAIT_S = 10.0  # far more than anything takes; a test that hangs fails instead
+WAIT_S = 10.0  # far longer than anything takes, so that a test fails instead of hanging
+
+_MAIN_ROLES: dict[str, ModelRole] = {"candidates": "classifier", "regression": "regressor"}
 
 
 class FakeDetector:
     """Sees the two boundaries of a straight ego lane in every frame; fails at a frame that is white all over."""
 
+    role: ModelRole = "classifier"
     slopes: tuple[float, ...] = (-1.15, 1.15)
 
-    def survey(self, image: Image, horizon: float | None = None) -> None:
-        pass
-
-    def prepare(
-        self,
-        image: Image,
-        horizon: float | None = None,
-        expected: Sequence[Curve] = (),
-        prior: object = None,
-        survey: object = None,
-    ) -> Prepared:
+    def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
         height, width = image.shape[:2]
-        view = RoadView(width, height, 0.4 * height if horizon is None else horizon)
-        return Prepared(image, (lambda: np.zeros((2, 8, 8, 3), np.uint8),), view, (), 1.0)
-
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Detections:
-        if prepared.image.min() == 255:
-            raise RuntimeError("a detector's own mistake")
+        view = RoadView(width, height, 0.4 * height if context.horizon is None else context.horizon)
+        infer(self.role, np.zeros((2, 8, 8, 3), np.uint8))
+        if image.min() == 255:
+            raise RuntimeError("the detector failed")
         found = []
-        for b in self.slopes:
-            curve = Curve(prepared.view.horizon, ((prepared.view.width - 1) / 2, b, 0.0))
-            rows = visible_rows(curve, prepared.view, 0.1)
-            if rows is None:
-                continue
-            found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9))
-        return Detections(tuple(found), prepared.view, prepared.horizon_weight)
+        for slope in self.slopes:
+            curve = Curve(view.horizon, (view.middle, slope, 0.0))
+            rows = visible_rows(curve, view)
+            if rows is not None:
+                found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9))
+        return Detections(tuple(found), view, horizon_weight=1.0)
 
 
 class LeftDetector(FakeDetector):
-    """Sees the left one of them alone."""
+    """Sees only the left boundary, with the regressor."""
 
+    role = "regressor"
     slopes = (-1.15,)
 
 
-class FakeNetwork:
-    """Answers at once."""
+class FakeModel:
+    """Returns its outputs immediately."""
 
     name = "fake 1"
-    provider = "cpu"
-    reason = "there is nothing else"
-    fell_back = False
+    largest_batch = 16
+    placement = Placement("cpu", "the fake runs nowhere else", 1, {"CPU": 1}, (1, 16))
     sha256 = "fa4e"
-    buckets = (1, 16)
     metadata: dict[str, Any] = {"kind": "fake"}  # noqa: RUF012
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         return np.full((len(inputs), 2), 0.5, np.float32)
 
 
-class OtherNetwork(FakeNetwork):
-    """Answers at once, by another name."""
+class OtherModel(FakeModel):
+    """The same with another name."""
 
     name = "other 2"
     metadata: dict[str, Any] = {"kind": "other fake"}  # noqa: RUF012
 
 
-class GatedNetwork(FakeNetwork):
+class GatedModel(FakeModel):
     """Holds every frame until it is let through."""
 
     def __init__(self) -> None:
@@ -95,38 +84,44 @@ class GatedNetwork(FakeNetwork):
         return super().run(inputs)
 
     def wait_for_a_frame(self) -> None:
-        """Returns when a frame is being held."""
+        """Waits until a frame is being held."""
         assert self._arrived.acquire(timeout=WAIT_S)
 
     def let_through(self, frames: int = 1) -> None:
-        """Lets frames pass, held ones or later ones."""
+        """Lets so many frames pass, those held now or later ones."""
         self._gate.release(frames)
 
 
-def engine(network: FakeNetwork | None = None) -> Engine:
-    """An engine of fakes."""
-    return Engine([Pipeline("candidates", FakeDetector(), network or FakeNetwork())])
+def engine(model: FakeModel | None = None, detector: FakeDetector | None = None) -> Engine:
+    """Returns an engine of fakes with one detector, `candidates`."""
+    return Engine({"classifier": model or FakeModel()}, {"candidates": detector or FakeDetector()}, _MAIN_ROLES)
+
+
+def left_engine() -> Engine:
+    """Returns an engine of fakes with one detector, `regression`, which sees only the left boundary."""
+    return Engine({"regressor": OtherModel()}, {"regression": LeftDetector()}, _MAIN_ROLES)
 
 
 def two_detectors() -> Engine:
-    """An engine of fakes with both detectors: `candidates`, the default, and `regression`, which sees less."""
-    return Engine([*engine().pipelines, Pipeline("regression", LeftDetector(), OtherNetwork())])
+    """Returns an engine of fakes with both detectors: `candidates`, the default, and `regression`."""
+    one, other = engine(), left_engine()
+    return Engine({**one.models, **other.models}, {**one.detectors, **other.detectors}, _MAIN_ROLES)
 
 
 def picture(width: int = 320, height: int = 180) -> Image:
-    """A grey ramp."""
+    """Returns a BGR image of a gray ramp."""
     return np.tile(np.linspace(30, 220, width).astype(np.uint8)[None, :, None], (height, 1, 3))
 
 
 def image_file(kind: str = ".jpg", width: int = 320, height: int = 180, shade: int | None = None) -> bytes:
-    """An image file of a grey ramp, or of one `shade`."""
+    """Returns an image file of a gray ramp, or of one `shade`."""
     ramp = picture(width, height)
     image = ramp if shade is None else np.full_like(ramp, shade)
     return cv2.imencode(kind, image)[1].tobytes()
 
 
 def limits(**other: float) -> Limits:
-    """Limits as a service tells them, some of them `other`."""
+    """Returns a service's limits, replaced by those in `other`."""
     usual: dict[str, Any] = {
         "max_bytes": 99_999,
         "max_pixels": 99_999,
@@ -141,7 +136,7 @@ def limits(**other: float) -> Limits:
 
 
 def ready(mode: Mode = "all", **other: Any) -> ReadyMessage:
-    """What a service says that has opened a new session, some of it `other`."""
+    """Returns the message for a new session, with the fields in `other`."""
     usual: dict[str, Any] = {
         "session": "x",
         "resume_token": "secret",
@@ -156,12 +151,12 @@ def ready(mode: Mode = "all", **other: Any) -> ReadyMessage:
 
 
 def pause(seconds: float) -> None:
-    """Lets real time pass, where a limit of the service is a time."""
+    """Waits in real time, for limits that are times."""
     time.sleep(seconds)
 
 
 def lanes(seq: int) -> LanesMessage:
-    """What a service says of a frame on which it sees no lanes."""
+    """Returns the message for a frame without lanes."""
     timing = TimingModel(decode=0, propose=0, queue=0, infer=0, track=0, total=0)
     ego = EgoModel(left=None, right=None, offset=None)
     return LanesMessage(

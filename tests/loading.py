@@ -1,4 +1,4 @@
-"""Functions that worker processes call to load an engine; most of them fail."""
+"""Functions by which worker processes load an engine; most of them fail."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lanestream.engine import Engine
 from lanestream.errors import ModelError
 
 
-class KillingNetwork(fakes.FakeNetwork):
+class KillingModel(fakes.FakeModel):
     """Kills its process in the first run."""
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -21,8 +21,8 @@ class KillingNetwork(fakes.FakeNetwork):
         return super().run(inputs)
 
 
-def deadly() -> Engine:
-    return fakes.engine(KillingNetwork())
+def killing() -> Engine:
+    return fakes.engine(KillingModel())
 
 
 def missing() -> Engine:

@@ -100,7 +100,7 @@ def test_sigterm_under_load_leaves_no_accepted_frame_unanswered(tmp_path: Path) 
 
 
 def test_a_draining_service_refuses_new_work_and_finishes_accepted_frames() -> None:
-    network = fakes.GatedNetwork()
+    network = fakes.GatedModel()
     app = create_app(fakes.engine(network), Settings(), None)
     listener = listen("127.0.0.1", 0)
     server = LanestreamServer(app, Settings())

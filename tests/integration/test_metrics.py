@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import fakes
@@ -94,10 +95,10 @@ def test_networks_are_reported_once_they_are_loaded(serve: Serve) -> None:
 
 
 def test_a_provider_fallback_is_reported(serve: Serve) -> None:
-    class FallbackNetwork(fakes.FakeNetwork):
-        fell_back = True
+    class FallbackModel(fakes.FakeModel):
+        placement = replace(fakes.FakeModel.placement, fell_back=True)
 
-    metrics = samples(serve(fakes.engine(FallbackNetwork())))
+    metrics = samples(serve(fakes.engine(FallbackModel())))
     assert value(metrics, "lane_provider_fallback", network="fake 1") == 1
 
 
@@ -113,7 +114,7 @@ def test_the_shipped_networks_are_reported_with_their_files(real_url: str) -> No
 
 
 def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
-    network = fakes.GatedNetwork()
+    network = fakes.GatedModel()
     url = serve(fakes.engine(network))
     with stream(url) as socket:
         socket.send(fakes.image_file())
@@ -145,7 +146,7 @@ def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
 
 
 def test_frames_of_a_disconnected_client_are_counted(serve: Serve) -> None:
-    network = fakes.GatedNetwork()
+    network = fakes.GatedModel()
     url = serve(fakes.engine(network))
     with stream(url, mode="all") as socket:
         for _ in range(3):

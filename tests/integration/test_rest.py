@@ -175,7 +175,7 @@ def test_schemas_and_documentation_are_available(url: str) -> None:
 
 
 def test_single_images_count_as_sessions(serve: Serve) -> None:
-    network = fakes.GatedNetwork()
+    network = fakes.GatedModel()
     url = serve(fakes.engine(network), max_sessions=1)
     with ThreadPoolExecutor(1) as executor:
         first = executor.submit(detect, url, fakes.image_file())

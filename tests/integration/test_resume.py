@@ -76,7 +76,7 @@ def test_a_new_socket_evicts_the_old_one(url: str) -> None:
 
 
 def test_a_frame_in_progress_is_finished_before_the_session_moves(serve: Serve) -> None:
-    network = fakes.GatedNetwork()
+    network = fakes.GatedModel()
     url = serve(fakes.engine(network))
     with stream(url) as old, stream(url) as new:
         token = start(old, mode="all")["resume_token"]
@@ -131,7 +131,7 @@ def test_an_idle_stream_is_closed_and_can_be_resumed(serve: Serve, limits: dict[
 
 
 def test_a_frame_in_progress_keeps_a_stream_open(serve: Serve) -> None:
-    network = fakes.GatedNetwork()
+    network = fakes.GatedModel()
     with stream(serve(fakes.engine(network), idle_s=0.2)) as socket:
         start(socket, mode="all")
         socket.send(fakes.image_file())

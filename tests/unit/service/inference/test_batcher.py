@@ -1,4 +1,4 @@
-"""Questions of many cameras, answered together. The networks are fakes, the thread is real."""
+"""The batcher: requests of many cameras in one run. The models are fakes, the threads are real."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lanestream.detection import Question
 from lanestream.errors import ExpiredError
-from lanestream.inference.batcher import Batcher, BatchQueue, BatchReport, Waiting
+from lanestream.inference.batcher import Batcher, BatchReport, InferenceRequest, InferenceResult, RequestQueue
 
 
-class Sums(fakes.FakeNetwork):
-    """Answers each input with the sum of its pixels; fails at a batch with an input of 255; remembers its batches.
+class SumModel(fakes.FakeModel):
+    """Returns the sum of each input's pixels; fails on a batch that contains an input of 255.
 
-    `threads` are those that they ran in, and `together` is how many ran at once at most.
+    Records the size of each batch, the thread that ran it, and the most runs at the same time.
     """
 
     def __init__(self) -> None:
@@ -28,11 +27,11 @@ class Sums(fakes.FakeNetwork):
         self.threads: list[str] = []
         self.may_run = threading.Event()
         self.may_run.set()
-        self.together = self._running = 0
+        self.most_parallel = self._running = 0
 
     def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         self._running += 1
-        self.together = max(self.together, self._running)
+        self.most_parallel = max(self.most_parallel, self._running)
         try:
             assert self.may_run.wait(fakes.WAIT_S)
             return self._sums(inputs)
@@ -43,156 +42,168 @@ class Sums(fakes.FakeNetwork):
         self.batches.append(len(inputs))
         self.threads.append(threading.current_thread().name)
         if len(inputs) and inputs.max() == 255:
-            raise RuntimeError("poison")
+            raise RuntimeError("the input is 255")
         return inputs.reshape(len(inputs), 1).astype(np.float32)
 
 
-def question(network: fakes.FakeNetwork, *values: int) -> Question:
-    return Question(network, np.array(values, np.uint8).reshape(-1, 1, 1, 1))
+def inputs_of(*values: int) -> NDArray[np.uint8]:
+    return np.array(values, np.uint8).reshape(-1, 1, 1, 1)
 
 
-def waiting(network: fakes.FakeNetwork, rows: int, deadline: float | None = None) -> Waiting:
-    return Waiting(question(network, *range(rows)), 0.0, deadline)
+def request(model: fakes.FakeModel, inputs: int, deadline: float | None = None) -> InferenceRequest:
+    return InferenceRequest(model, inputs_of(*range(inputs)), 0.0, deadline)
 
 
-def rows(batch: list[Waiting]) -> list[int]:
-    return [each.rows for each in batch]
+def sizes_of(requests: list[InferenceRequest]) -> list[int]:
+    return [len(each.inputs) for each in requests]
 
 
-def test_what_fits_into_one_run_goes_together_in_the_order_it_came() -> None:
-    queue, network = BatchQueue(), Sums()
-    for count in (7, 6, 4, 3, 16):
-        queue.add(waiting(network, count))
-    taken = [rows(queue.take(0.0)[0]) for _ in range(4)]
-    assert taken == [[7, 6, 3], [4], [16], []]
+def sums(result: InferenceResult) -> list[float]:
+    values: list[float] = result.outputs.ravel().tolist()
+    return values
 
 
-def test_one_run_is_of_one_network_and_the_oldest_question_chooses_it() -> None:
-    queue, one, other = BatchQueue(), Sums(), Sums()
-    for network in (other, one, other, one):
-        queue.add(waiting(network, 2))
+def test_requests_that_fit_into_one_run_are_batched_in_the_order_of_their_arrival() -> None:
+    queue, model = RequestQueue(), SumModel()
+    for inputs in (7, 6, 4, 3, 16):
+        queue.add(request(model, inputs))
+    batches = [sizes_of(queue.take(0.0)[0]) for _ in range(4)]
+    assert batches == [[7, 6, 3], [4], [16], []]
+
+
+def test_a_batch_has_one_model_which_the_oldest_request_chooses() -> None:
+    queue, one, other = RequestQueue(), SumModel(), SumModel()
+    for model in (other, one, other, one):
+        queue.add(request(model, 2))
     first, second = queue.take(0.0)[0], queue.take(0.0)[0]
-    assert {each.question.network for each in first} == {other}
-    assert {each.question.network for each in second} == {one}
+    assert {each.model for each in first} == {other}
+    assert {each.model for each in second} == {one}
     assert len(first) == len(second) == 2
 
 
-def test_a_question_larger_than_any_batch_goes_alone() -> None:
-    queue, network = BatchQueue(), Sums()
-    queue.add(waiting(network, 40))
-    queue.add(waiting(network, 1))
-    assert rows(queue.take(0.0)[0]) == [40]
-    assert rows(queue.take(0.0)[0]) == [1]
+def test_a_request_larger_than_the_largest_batch_runs_alone() -> None:
+    queue, model = RequestQueue(), SumModel()
+    queue.add(request(model, 40))
+    queue.add(request(model, 1))
+    assert sizes_of(queue.take(0.0)[0]) == [40]
+    assert sizes_of(queue.take(0.0)[0]) == [1]
 
 
-def test_expired_questions_are_told_apart_and_never_run() -> None:
-    queue, network = BatchQueue(), Sums()
-    queue.add(waiting(network, 1, deadline=5.0))
-    queue.add(waiting(network, 2, deadline=7.0))
-    queue.add(waiting(network, 3))
+def test_expired_requests_are_returned_apart_from_the_batch() -> None:
+    queue, model = RequestQueue(), SumModel()
+    queue.add(request(model, 1, deadline=5.0))
+    queue.add(request(model, 2, deadline=7.0))
+    queue.add(request(model, 3))
     batch, expired = queue.take(6.0)
-    assert rows(expired) == [1]
-    assert rows(batch) == [2, 3]
+    assert sizes_of(expired) == [1]
+    assert sizes_of(batch) == [2, 3]
     assert len(queue) == 0
 
 
 @given(st.lists(st.integers(0, 20), max_size=40))
-def test_every_question_is_taken_once_and_no_run_is_too_large(sizes: list[int]) -> None:
-    queue, network = BatchQueue(), Sums()
+def test_every_request_is_taken_once_and_no_batch_is_too_large(sizes: list[int]) -> None:
+    queue, model = RequestQueue(), SumModel()
     for size in sizes:
-        queue.add(waiting(network, size))
+        queue.add(request(model, size))
     taken: list[int] = []
     while len(queue):
-        batch, _ = queue.take(0.0)
-        assert sum(rows(batch)) <= max(16, batch[0].rows)
-        taken += rows(batch)
+        batch = sizes_of(queue.take(0.0)[0])
+        assert sum(batch) <= max(model.largest_batch, batch[0])
+        taken += batch
     assert sorted(taken) == sorted(sizes)
 
 
-def test_each_gets_the_rows_it_asked_for() -> None:
+def test_each_request_gets_the_outputs_of_its_own_inputs() -> None:
     reports: list[BatchReport] = []
-    network, batcher = Sums(), Batcher(reports.append)
-    network.may_run.clear()
-    first = batcher.ask(question(network, 1))
-    others = [batcher.ask(question(network, *values)) for values in ((2, 3), (), (4,))]
-    network.may_run.set()
-    assert first.result(fakes.WAIT_S).outputs.ravel().tolist() == [1]
-    assert [other.result(fakes.WAIT_S).outputs.ravel().tolist() for other in others] == [[2, 3], [], [4]]
+    model, batcher = SumModel(), Batcher(reports.append)
+    model.may_run.clear()
+    first = batcher.submit(model, inputs_of(1))
+    others = [batcher.submit(model, inputs_of(*values)) for values in ((2, 3), (), (4,))]
+    model.may_run.set()
+    assert sums(first.result(fakes.WAIT_S)) == [1]
+    assert [sums(other.result(fakes.WAIT_S)) for other in others] == [[2, 3], [], [4]]
     batcher.close()
-    assert sum(report.questions for report in reports) == 4
-    assert sum(report.rows for report in reports) == 4
-    assert sum(network.batches) == 4
+    assert sum(report.requests for report in reports) == 4
+    assert sum(report.inputs for report in reports) == 4
+    assert sum(model.batches) == 4
 
 
-def test_who_waits_runs_an_idle_network_itself() -> None:
+def test_a_result_says_when_its_run_began_and_ended() -> None:
+    batcher = Batcher()
+    result = batcher.run(SumModel(), inputs_of(1))
+    assert 0.0 <= result.ended - result.started < fakes.WAIT_S
+    batcher.close()
+
+
+def test_a_caller_that_waits_runs_an_idle_model_itself() -> None:
     reports: list[BatchReport] = []
-    network, batcher = Sums(), Batcher(reports.append)
-    assert batcher.answer(question(network, 1, 2)).outputs.ravel().tolist() == [1, 2]
-    with pytest.raises(RuntimeError, match="poison"):
-        batcher.answer(question(network, 255))
+    model, batcher = SumModel(), Batcher(reports.append)
+    assert sums(batcher.run(model, inputs_of(1, 2))) == [1, 2]
+    with pytest.raises(RuntimeError, match="the input is 255"):
+        batcher.run(model, inputs_of(255))
     with pytest.raises(ExpiredError):
-        batcher.answer(question(network, 3), deadline=0.0)
-    assert network.batches == [2, 1]
-    assert set(network.threads) == {threading.current_thread().name}
-    assert batcher.ask(question(network, 9)).result(fakes.WAIT_S).outputs.tolist() == [[9]], "the thread works too"
+        batcher.run(model, inputs_of(3), deadline=0.0)
+    assert model.batches == [2, 1]
+    assert set(model.threads) == {threading.current_thread().name}
+    assert sums(batcher.submit(model, inputs_of(9)).result(fakes.WAIT_S)) == [9], "the batcher's thread works too"
     batcher.close()
-    assert [report.rows for report in reports] == [2, 1]
+    assert [report.inputs for report in reports] == [2, 1]
     with pytest.raises(RuntimeError, match="closed"):
-        batcher.answer(question(network, 1))
+        batcher.run(model, inputs_of(1))
 
 
-def test_one_run_at_a_time_whoever_does_it() -> None:
-    network, batcher = Sums(), Batcher()
-    network.may_run.clear()
-    with ThreadPoolExecutor(4) as askers:
-        answers = [askers.submit(batcher.answer, question(network, value)) for value in range(4)]
-        asked = [batcher.ask(question(network, value)) for value in range(4, 6)]
-        assert not any(each.done() for each in answers)
-        network.may_run.set()
-        found = [each.result(fakes.WAIT_S).outputs.item() for each in answers]
-    assert found == [0, 1, 2, 3]
-    assert [each.result(fakes.WAIT_S).outputs.item() for each in asked] == [4, 5]
+def test_batches_run_one_at_a_time_in_any_thread() -> None:
+    model, batcher = SumModel(), Batcher()
+    model.may_run.clear()
+    with ThreadPoolExecutor(4) as callers:
+        called = [callers.submit(batcher.run, model, inputs_of(value)) for value in range(4)]
+        submitted = [batcher.submit(model, inputs_of(value)) for value in range(4, 6)]
+        assert not any(each.done() for each in called)
+        model.may_run.set()
+        found = [sums(each.result(fakes.WAIT_S)) for each in called]
+    assert found == [[0], [1], [2], [3]]
+    assert [sums(each.result(fakes.WAIT_S)) for each in submitted] == [[4], [5]]
     batcher.close()
-    assert network.together == 1
-    assert sum(network.batches) == 6
+    assert model.most_parallel == 1
+    assert sum(model.batches) == 6
 
 
-def test_a_poisoned_question_fails_alone() -> None:
-    network, batcher = Sums(), Batcher()
-    network.may_run.clear()
-    head = batcher.ask(question(network, 0))
-    good, bad, other = (batcher.ask(question(network, *values)) for values in ((1, 2), (255,), (3,)))
-    network.may_run.set()
-    assert head.result(fakes.WAIT_S).outputs.shape == (1, 1)
-    assert good.result(fakes.WAIT_S).outputs.ravel().tolist() == [1, 2]
-    assert other.result(fakes.WAIT_S).outputs.ravel().tolist() == [3]
-    with pytest.raises(RuntimeError, match="poison"):
+def test_a_request_that_makes_a_batch_fail_fails_alone() -> None:
+    model, batcher = SumModel(), Batcher()
+    model.may_run.clear()
+    first = batcher.submit(model, inputs_of(0))
+    good, bad, other = (batcher.submit(model, inputs_of(*values)) for values in ((1, 2), (255,), (3,)))
+    model.may_run.set()
+    assert first.result(fakes.WAIT_S).outputs.shape == (1, 1)
+    assert sums(good.result(fakes.WAIT_S)) == [1, 2]
+    assert sums(other.result(fakes.WAIT_S)) == [3]
+    with pytest.raises(RuntimeError, match="the input is 255"):
         bad.result(fakes.WAIT_S)
-    assert batcher.ask(question(network, 9)).result(fakes.WAIT_S).outputs.tolist() == [[9]], "the thread lives on"
+    assert sums(batcher.submit(model, inputs_of(9)).result(fakes.WAIT_S)) == [9], "the batcher's thread still works"
     batcher.close()
 
 
-def test_expired_and_unwanted_questions_cost_no_run() -> None:
-    network, batcher = Sums(), Batcher()
-    network.may_run.clear()
-    head = batcher.ask(question(network, 0))
-    unwanted = batcher.ask(question(network, 1))
-    expired = batcher.ask(question(network, 2), deadline=0.0)
-    assert unwanted.cancel()
-    network.may_run.set()
+def test_expired_and_canceled_requests_are_never_run() -> None:
+    model, batcher = SumModel(), Batcher()
+    model.may_run.clear()
+    first = batcher.submit(model, inputs_of(0))
+    canceled = batcher.submit(model, inputs_of(1))
+    expired = batcher.submit(model, inputs_of(2), deadline=0.0)
+    assert canceled.cancel()
+    model.may_run.set()
     with pytest.raises(ExpiredError):
         expired.result(fakes.WAIT_S)
-    head.result(fakes.WAIT_S)
+    first.result(fakes.WAIT_S)
     batcher.close()
-    assert network.batches == [1]
+    assert model.batches == [1]
 
 
-def test_closing_answers_what_waits_and_takes_no_more() -> None:
-    network, batcher = Sums(), Batcher()
-    network.may_run.clear()
-    asked = [batcher.ask(question(network, value)) for value in range(5)]
-    network.may_run.set()
+def test_close_runs_what_waits_and_accepts_no_more() -> None:
+    model, batcher = SumModel(), Batcher()
+    model.may_run.clear()
+    submitted = [batcher.submit(model, inputs_of(value)) for value in range(5)]
+    model.may_run.set()
     batcher.close()
-    assert [each.result(0).outputs.item() for each in asked] == [0, 1, 2, 3, 4]
+    assert [sums(each.result(0)) for each in submitted] == [[0], [1], [2], [3], [4]]
     with pytest.raises(RuntimeError, match="closed"):
-        batcher.ask(question(network, 1))
+        batcher.submit(model, inputs_of(1))

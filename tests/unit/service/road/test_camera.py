@@ -1,4 +1,4 @@
-"""Lanes in metres: the parabola on the road that a curve in the image is."""
+"""Lanes in meters: each curve of the image is a parabola on the road."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ Ground = tuple[float, float, float]
 
 
 def focal_length(field_of_view: float) -> float:
-    """In pixels: the ray through the image's right edge, WIDTH / 2 from its middle, is half the field of view off."""
+    """Returns it in pixels: half the field of view is between the middle and the right edge, WIDTH / 2 from it."""
     return WIDTH / 2.0 / math.tan(math.radians(field_of_view / 2.0))
 
 
 def project(ground: Ground, camera: Camera, forward: float) -> tuple[float, float]:
-    """(x, y) in the image of the point of a ground parabola `forward` metres ahead, through a pinhole."""
+    """Returns the pixel (x, y) of the point `forward` meters ahead on a ground parabola, by a pinhole camera."""
     a, b, c = ground
     left = a * forward**2 + b * forward + c
     scale = focal_length(camera.field_of_view) / forward
     return (WIDTH - 1) / 2.0 - scale * left, HORIZON + scale * camera.height
 
 
-def seen(ground: Ground, model: CameraModel = MODEL) -> Curve:
-    """The curve through the images of three points of a ground parabola."""
+def in_image(ground: Ground, model: CameraModel = MODEL) -> Curve:
+    """Returns the curve through the pixels of three points of a ground parabola."""
     camera = Camera(model.height, model.field_of_view)
     columns, rows = zip(*(project(ground, camera, forward) for forward in (5.0, 12.0, 30.0)), strict=True)
     return Curve.through(HORIZON, np.array(rows), np.array(columns))
@@ -47,9 +47,9 @@ def seen(ground: Ground, model: CameraModel = MODEL) -> Curve:
 def message(
     sides: dict[int, Ground], *, ego: EgoLane | None = None, camera: CameraModel | None = MODEL
 ) -> LanesMessage:
-    """What is told of a road whose boundaries' track ids are `sides`; 1 is the ego lane's left one, 2 its right one."""
+    """Returns the message for a road with the boundaries `sides` by track id; 1 is ego left, 2 is ego right."""
     lanes = tuple(
-        LaneBoundary(track, -1 if track == 1 else 1, "detected", 0.9, seen(ground), np.eye(3), 340.0, 719.0, 1.0)
+        LaneBoundary(track, -1 if track == 1 else 1, "detected", 0.9, in_image(ground), np.eye(3), 340.0, 719.0, 1.0)
         for track, ground in sides.items()
     )
     ego = ego or EgoLane(1 if 1 in sides else None, 2 if 2 in sides else None, 0.0)
@@ -65,15 +65,15 @@ def message(
     b=st.floats(-0.2, 0.2),
     c=st.floats(-8.0, 8.0),
 )
-def test_a_ground_parabola_comes_back_exactly(
+def test_a_ground_parabola_is_recovered_exactly(
     height: float, field_of_view: float, a: float, b: float, c: float
 ) -> None:
     camera, focal = Camera(height, field_of_view), focal_length(field_of_view)
     curve = Curve(HORIZON, ((WIDTH - 1) / 2.0 - focal * b, -c / height, -a * focal**2 * height))
     for forward in (3.0, 10.0, 40.0):
         x, y = project((a, b, c), camera, forward)
-        if y - HORIZON > 1.0:  # nearer to the horizon a curve counts as one row below it
-            assert float(curve.x(y)) == pytest.approx(x, abs=1e-6), "the analytic curve is what a pinhole sees"
+        if y - HORIZON > 1.0:  # nearer to the horizon a row offset counts as 1
+            assert float(curve.x(y)) == pytest.approx(x, abs=1e-6), "the curve is what a pinhole camera sees"
     assert camera.ground(curve, WIDTH) == pytest.approx((a, b, c), rel=1e-9, abs=1e-12)
 
 
@@ -83,46 +83,47 @@ def test_a_wider_view_has_a_shorter_focal_length() -> None:
     assert Camera(1.4, 60.0).focal_length(1280) == pytest.approx(1108.513, abs=1e-3)
 
 
-def test_a_straight_centred_lane_has_no_offset_and_its_width() -> None:
-    told = message({1: (0.0, 0.0, 1.75), 2: (0.0, 0.0, -1.75)})
-    assert [lane.ground for lane in told.lanes] == [
+def test_a_straight_centered_lane_has_no_offset_and_its_width() -> None:
+    lanes = message({1: (0.0, 0.0, 1.75), 2: (0.0, 0.0, -1.75)})
+    assert [lane.ground for lane in lanes.lanes] == [
         pytest.approx((0.0, 0.0, 1.75), abs=1e-6),
         pytest.approx((0.0, 0.0, -1.75), abs=1e-6),
     ]
-    ego = told.ego
+    ego = lanes.ego
     assert (ego.offset_m, ego.lane_width_m, ego.heading, ego.curvature) == pytest.approx((0.0, 3.5, 0.0, 0.0), abs=1e-6)
 
 
-def test_a_camera_right_of_the_centre_in_a_lane_that_goes_left() -> None:
+def test_a_camera_right_of_the_center_in_a_lane_that_turns_left() -> None:
     curvature, heading = 1.0 / 400.0, 0.03
     a, b = curvature / 2.0, math.tan(heading)
-    told = message({1: (a, b, 2.0), 2: (a, b, -1.4)})
-    ego = told.ego
-    assert (ego.offset_m, ego.lane_width_m) == pytest.approx((0.3, 3.4), abs=1e-3), "positive to the right, as `offset`"
+    ego = message({1: (a, b, 2.0), 2: (a, b, -1.4)}).ego
+    assert (ego.offset_m, ego.lane_width_m) == pytest.approx((0.3, 3.4), abs=1e-3), (
+        "positive to the right, like `offset`"
+    )
     assert (ego.heading, ego.curvature) == pytest.approx((heading, curvature), abs=1e-6)
     top = [lane.line.top[0] - lane.line.bottom[0] for lane in message({2: (a, b, 0.0), 3: (-a, -b, 0.0)}).lanes]
-    assert top[0] < 0.0 < top[1], "what goes left on the ground goes left in the image"
+    assert top[0] < 0.0 < top[1], "what turns left on the ground turns left in the image"
 
 
-def test_the_offset_in_metres_has_the_sign_of_the_share() -> None:
-    """A lane whose centre is to the left in the image: the camera is right of it."""
-    left, right = seen((0.0, 0.0, 2.5)), seen((0.0, 0.0, -1.0))
-    centre = (float(left.x(719.0)) + float(right.x(719.0))) / 2.0
-    assert centre < (WIDTH - 1) / 2.0
+def test_the_offset_in_meters_has_the_sign_of_the_offset_in_lane_widths() -> None:
+    """The lane's center is left of the image's middle, so the camera is right of it."""
+    left, right = in_image((0.0, 0.0, 2.5)), in_image((0.0, 0.0, -1.0))
+    center = (float(left.x(719.0)) + float(right.x(719.0))) / 2.0
+    assert center < (WIDTH - 1) / 2.0
     assert (message({1: (0.0, 0.0, 2.5), 2: (0.0, 0.0, -1.0)}).ego.offset_m or 0.0) == pytest.approx(0.75, abs=1e-3)
 
 
-def test_one_boundary_tells_where_the_lane_goes_but_not_how_wide_it_is() -> None:
+def test_one_boundary_gives_the_direction_of_the_lane_but_not_its_width() -> None:
     ego = message({2: (5e-4, 0.01, -1.6)}).ego
     assert (ego.offset_m, ego.lane_width_m) == (None, None)
     assert (ego.heading, ego.curvature) == pytest.approx((0.01, 1e-3), abs=1e-5)
-    beside = message({2: (5e-4, 0.01, -1.6)}, ego=EgoLane())
-    assert beside.lanes[0].ground == pytest.approx((5e-4, 0.01, -1.6), abs=1e-6)
-    assert beside.ego.model_dump(exclude_none=True) == {}
+    other = message({2: (5e-4, 0.01, -1.6)}, ego=EgoLane())
+    assert other.lanes[0].ground == pytest.approx((5e-4, 0.01, -1.6), abs=1e-6)
+    assert other.ego.model_dump(exclude_none=True) == {}
 
 
 @given(a=st.floats(-2e-3, 2e-3), b=st.floats(-0.2, 0.2), c=st.floats(-8.0, 8.0))
-def test_what_is_told_is_exact_to_a_millimetre_over_a_hundred_metres(a: float, b: float, c: float) -> None:
+def test_a_message_is_exact_to_a_millimeter_at_a_hundred_meters(a: float, b: float, c: float) -> None:
     ground = message({1: (a, b, c)}).lanes[0].ground
     assert ground is not None
     for forward in (0.0, 20.0, 100.0):
@@ -130,14 +131,14 @@ def test_what_is_told_is_exact_to_a_millimetre_over_a_hundred_metres(a: float, b
         assert ground[0] * forward**2 + ground[1] * forward + ground[2] == pytest.approx(left, abs=1e-3)
 
 
-def test_without_a_camera_all_metres_are_null() -> None:
-    told = message({1: (0.0, 0.0, 1.75), 2: (0.0, 0.0, -1.75)}, camera=None)
-    assert [lane.ground for lane in told.lanes] == [None, None]
-    assert told.ego.model_dump(exclude_none=True) == {"left": 1, "right": 2, "offset": 0.0}
-    assert '"ground":null' in told.model_dump_json()
+def test_without_a_camera_all_meters_are_null() -> None:
+    lanes = message({1: (0.0, 0.0, 1.75), 2: (0.0, 0.0, -1.75)}, camera=None)
+    assert [lane.ground for lane in lanes.lanes] == [None, None]
+    assert lanes.ego.model_dump(exclude_none=True) == {"left": 1, "right": 2, "offset": 0.0}
+    assert '"ground":null' in lanes.model_dump_json()
 
 
-def test_a_start_message_carries_a_camera() -> None:
+def test_a_start_message_has_a_camera() -> None:
     start = parse_client_message('{"type": "start", "camera": {"height": 1.4, "field_of_view": 62}}')
     assert isinstance(start, StartMessage)
     assert start.camera == MODEL
@@ -156,23 +157,23 @@ def test_a_start_message_carries_a_camera() -> None:
         ("1.4", "camera"),
     ],
 )
-def test_a_bad_camera_is_refused_in_a_line(camera: str, where: str) -> None:
+def test_an_invalid_camera_is_an_error_of_one_line(camera: str, where: str) -> None:
     with pytest.raises(ProtocolError, match=where) as caught:
         parse_client_message(f'{{"type": "start", "camera": {camera}}}')
     assert "\n" not in str(caught.value)
 
 
-def test_programs_are_told_of_a_bad_camera_where_they_make_it() -> None:
+def test_an_invalid_camera_cannot_be_built() -> None:
     with pytest.raises(ValidationError, match=r"greater than or equal to 0\.3"):
         CameraModel(height=0.0, field_of_view=62.0)
 
 
-def test_the_schemas_have_it() -> None:
-    told = json_schemas()
-    camera = told["client"]["$defs"]["CameraModel"]["properties"]
+def test_the_schemas_describe_cameras_and_meters() -> None:
+    schemas = json_schemas()
+    camera = schemas["client"]["$defs"]["CameraModel"]["properties"]
     assert (camera["height"]["minimum"], camera["height"]["maximum"]) == (0.3, 4.0)
     assert (camera["field_of_view"]["minimum"], camera["field_of_view"]["maximum"]) == (20.0, 150.0)
-    assert "camera" in told["client"]["$defs"]["StartMessage"]["properties"]
-    assert "ground" in told["server"]["$defs"]["LaneModel"]["properties"]
-    ego = told["server"]["$defs"]["EgoModel"]["properties"]
+    assert "camera" in schemas["client"]["$defs"]["StartMessage"]["properties"]
+    assert "ground" in schemas["server"]["$defs"]["LaneModel"]["properties"]
+    ego = schemas["server"]["$defs"]["EgoModel"]["properties"]
     assert {"offset_m", "lane_width_m", "heading", "curvature"} <= set(ego)

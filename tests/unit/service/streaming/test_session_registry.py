@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import fakes
 import pytest
 
-from lanestream.detection import answered
 from lanestream.errors import BusyError, NoDetectorError, StoreError, TooOldError
 from lanestream.images.decoding import ImageLimits
 from lanestream.protocol import StartMessage
@@ -53,8 +52,8 @@ def make_registry(store: MemoryStore | None = None, clock: Clock | None = None, 
 
 
 def process_frame(session: OpenSession, timestamp: float) -> FrameResult:
-    assert isinstance(session.camera, Session)
-    return answered(session.camera.follow(fakes.picture(), timestamp))
+    assert isinstance(session.handle, Session)
+    return fakes.engine().process(session.handle, fakes.picture(), timestamp)
 
 
 async def start(registry: SessionRegistry, caller: Caller = ANN, token: str | None = None) -> OpenSession:
@@ -73,11 +72,11 @@ async def test_another_replica_resumes_a_session_exactly() -> None:
     second = await start(other, token=first.token)
     assert (second.resume_outcome, second.id, second.token) == ("resumed", first.id, first.token)
     assert (second.last_seq, second.stream_s, second.born) == (9, 23.5, first.born)
-    assert second.camera.state == first.camera.state
+    assert second.handle.state == first.handle.state
     after = process_frame(second, 1.0)
     assert [lane.track_id for lane in after.lanes] == [lane.track_id for lane in before.lanes] == [1, 2]
     process_frame(first, 1.0)
-    assert second.camera.state == first.camera.state, "exactly, to the last digit"
+    assert second.handle.state == first.handle.state, "exactly, to the last digit"
     assert [lane.age_s for lane in after.lanes] == [1.0, 1.0]
 
 
@@ -90,7 +89,7 @@ async def test_ids_that_a_crashed_replica_may_have_assigned_are_not_assigned_aga
     await asyncio.sleep(0.3)
     second = await start(other, token=first.token)
     assert second.resume_outcome == "resumed"
-    before, after = first.camera.state.tracker, second.camera.state.tracker
+    before, after = first.handle.state.tracker, second.handle.state.tracker
     assert after.tracks == before.tracks
     assert after.next_id > before.next_id
 

@@ -1,4 +1,4 @@
-"""Worker processes without a service around them: real processes, fake networks."""
+"""Worker processes without a service around them: real processes, fake models."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from lanestream.errors import (
 from lanestream.images.decoding import ImageLimits
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame
-from lanestream.workers.ipc import Setup, packed, receive
-from lanestream.workers.pool import Places, WorkerPool
-from lanestream.workers.process_pool import ProcessPool, usual_processes
+from lanestream.workers.ipc import WorkerSetup, encode_message, receive_message
+from lanestream.workers.pool import WorkerPool
+from lanestream.workers.process_pool import ProcessPool, default_processes
 from lanestream.workers.thread_pool import ThreadPool
 from lanestream.workers.worker_main import portable
 
@@ -42,10 +42,10 @@ LOG: dict[str, Any] = {"version": 1}
 
 @pytest.fixture(autouse=True)
 def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Worker processes find the engines that tests load."""
+    """Lets worker processes import the functions that load an engine."""
     tests = Path(__file__).parents[3]
-    more = [str(tests), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(more))
+    path = [str(tests), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
 
 
 def frame(data: bytes | None = None, timestamp: float = 0.0) -> EncodedFrame:
@@ -53,132 +53,133 @@ def frame(data: bytes | None = None, timestamp: float = 0.0) -> EncodedFrame:
 
 
 @asynccontextmanager
-async def started(load: Callable[[], Engine], processes: int = 1, **more: Any) -> AsyncIterator[ProcessPool]:
-    runner = await ProcessPool.started(Setup(load, LIMITS, 1, LOG), processes, **more)
+async def started(load: Callable[[], Engine], processes: int = 1, **options: Any) -> AsyncIterator[ProcessPool]:
+    pool = await ProcessPool.start(WorkerSetup(load, LIMITS, 1, LOG), processes, **options)
     try:
-        yield runner
+        yield pool
     finally:
-        await runner.close()
+        await pool.close()
 
 
-async def lanes(runner: WorkerPool, frames: int) -> list[object]:
-    camera = runner.open_camera()
-    results = []
+async def lanes(pool: WorkerPool, frames: int) -> list[object]:
+    """Returns the lanes of each frame of a new session, and then its state."""
+    session = pool.open_session()
+    results: list[object] = []
     for number in range(frames):
-        async with runner.turn():
-            processed = await runner.run(camera, frame(timestamp=0.1 * number))
+        async with pool.admit():
+            processed = await pool.run(session, frame(timestamp=0.1 * number))
         results.append([(lane.track_id, lane.curve, lane.covariance.tolist()) for lane in processed.result.lanes])
-    return [*results, camera.state]
+    return [*results, session.state]
 
 
-async def test_lanes_and_memory_are_those_of_threads_to_the_last_digit() -> None:
+async def test_lanes_and_states_are_exactly_those_of_threads() -> None:
     threads = ThreadPool(fakes.engine(), LIMITS, threads=2)
     async with started(fakes.engine, 2) as processes:
         assert len(processes.pids) == 2
-        told = await asyncio.gather(*(lanes(processes, 6) for _ in range(3)))
-    assert told == [await lanes(threads, 6)] * 3
+        results = await asyncio.gather(*(lanes(processes, 6) for _ in range(3)))
+    assert results == [await lanes(threads, 6)] * 3
     await threads.close()
 
 
-async def test_what_is_offered_is_what_the_workers_have() -> None:
-    async with started(fakes.two_detectors) as runner:
-        assert [offer.detector for offer in runner.offers.all] == ["candidates", "regression"]
-        assert runner.offers.chosen("regression").network.name == "other 2"
-        processed = await runner.run(runner.open_camera(detector="regression"), frame())
+async def test_the_capabilities_are_those_of_the_workers() -> None:
+    async with started(fakes.two_detectors) as pool:
+        assert [info.detector for info in pool.capabilities.detectors] == ["candidates", "regression"]
+        assert pool.capabilities.select("regression").model.name == "other 2"
+        processed = await pool.run(pool.open_session(detector="regression"), frame())
         assert len(processed.result.lanes) == 1
-    async with started(fakes.engine) as runner:
+    async with started(fakes.engine) as pool:
         with pytest.raises(NoDetectorError, match="there is no detector regression here"):
-            runner.open_camera(detector="regression")
+            pool.open_session(detector="regression")
 
 
-async def test_errors_come_back_and_leave_the_camera_as_it_was() -> None:
+async def test_errors_are_raised_and_leave_the_session_as_it_was() -> None:
     reports: list[object] = []
-    async with started(fakes.engine, observe=reports.append) as runner:
-        camera = runner.open_camera()
-        await runner.run(camera, frame())
-        before = camera.state
+    async with started(fakes.engine, observe=reports.append) as pool:
+        session = pool.open_session()
+        await pool.run(session, frame())
+        before = session.state
         with pytest.raises(ImageError, match="it looks like text") as refused:
-            await runner.run(camera, frame(b"hello, this is text"))
+            await pool.run(session, frame(b"hello, this is text"))
         assert refused.value.hint
-        with pytest.raises(RuntimeError, match="RuntimeError: a detector's own mistake") as mistake:
-            await runner.run(camera, frame(fakes.image_file(shade=255)))
-        assert "in finish" in "".join(mistake.value.__notes__)
-        assert camera.state == before
-        assert (await runner.run(camera, frame(timestamp=0.1))).result.lanes[0].track_id == 1
+        with pytest.raises(RuntimeError, match="RuntimeError: the detector failed") as failure:
+            await pool.run(session, frame(fakes.image_file(shade=255)))
+        assert "in detect" in "".join(failure.value.__notes__)
+        assert session.state == before
+        assert (await pool.run(session, frame(timestamp=0.1))).result.lanes[0].track_id == 1
     assert len(reports) == 3
 
 
-async def test_a_worker_that_ends_loses_its_frame_alone_and_is_replaced() -> None:
-    async with started(loading.deadly) as runner:
-        camera = runner.open_camera()
-        (first,) = runner.pids
-        before = camera.state
+async def test_a_worker_that_ends_loses_only_its_frame_and_is_replaced() -> None:
+    async with started(loading.killing) as pool:
+        session = pool.open_session()
+        (first,) = pool.pids
+        before = session.state
         with pytest.raises(WorkerLostError):
-            await runner.run(camera, frame())
-        assert camera.state == before
-        while not runner.works:
+            await pool.run(session, frame())
+        assert session.state == before
+        while not pool.works:
             with pytest.raises(WorkerLostError):
-                await runner.run(camera, frame())
+                await pool.run(session, frame())
             await asyncio.sleep(0.05)
-        (second,) = runner.pids
+        (second,) = pool.pids
         assert second != first
         assert not psutil.pid_exists(first)
 
 
 async def test_a_worker_that_hangs_is_ended_and_replaced(caplog: pytest.LogCaptureFixture) -> None:
-    async with started(fakes.engine, patience_s=1.0) as runner:
-        camera = runner.open_camera()
-        (first,) = runner.pids
+    async with started(fakes.engine, frame_s=1.0) as pool:
+        session = pool.open_session()
+        (first,) = pool.pids
         os.kill(first, signal.SIGSTOP)
         with pytest.raises(WorkerLostError):
-            await runner.run(camera, frame())
+            await pool.run(session, frame())
         assert not psutil.pid_exists(first)
-        assert "a worker process has been at a frame for 1 s; it is ended" in caplog.text
-        while not runner.works:
+        assert "a worker process took more than 1 s for a frame; it is ended" in caplog.text
+        while not pool.works:
             await asyncio.sleep(0.05)
-        os.kill(*runner.pids, 0)  # another one, and it lives
-        assert runner.pids != (first,)
+        os.kill(*pool.pids, 0)  # another process, which is alive
+        assert pool.pids != (first,)
 
 
-async def test_a_service_that_was_suspended_goes_on_with_the_same_workers() -> None:
-    async with started(fakes.engine, patience_s=1.0) as runner:
-        camera = runner.open_camera()
-        (first,) = runner.pids
+async def test_a_service_that_was_suspended_keeps_its_workers() -> None:
+    async with started(fakes.engine, frame_s=1.0) as pool:
+        session = pool.open_session()
+        (first,) = pool.pids
         os.kill(first, signal.SIGSTOP)
-        answer = asyncio.create_task(runner.run(camera, frame()))
+        processed = asyncio.create_task(pool.run(session, frame()))
         await asyncio.sleep(0.05)
         time.sleep(1.5)  # the event loop is as suspended as the worker
         os.kill(first, signal.SIGCONT)
-        assert (await answer).result.lanes
-        assert runner.pids == (first,)
+        assert (await processed).result.lanes
+        assert pool.pids == (first,)
 
 
-async def test_a_deadline_holds_in_the_worker_too() -> None:
-    async with started(fakes.engine) as runner:
+async def test_a_deadline_applies_in_the_worker_too() -> None:
+    async with started(fakes.engine) as pool:
         late = EncodedFrame(fakes.image_file(), 0.0, time.monotonic(), deadline=time.monotonic() - 1.0)
         with pytest.raises(LanestreamError, match="waited too long"):
-            await runner.run(runner.open_camera(), late)
+            await pool.run(pool.open_session(), late)
 
 
 @pytest.mark.parametrize(
-    ("load", "told"),
+    ("load", "message"),
     [
         (loading.missing, "no model file at x"),
         (loading.broken, "OSError: the disk is broken"),
-        (loading.silent, "ended while it started: 3"),
+        (loading.silent, "ended with status 3 while it started"),
     ],
 )
 @pytest.mark.parametrize("processes", [1, 2])
-async def test_what_can_not_be_loaded_is_told_and_no_process_stays(
-    load: Callable[[], Engine], told: str, processes: int
+async def test_an_engine_that_cannot_be_loaded_is_an_error_and_no_process_is_left(
+    load: Callable[[], Engine], message: str, processes: int
 ) -> None:
-    with pytest.raises((LanestreamError, RuntimeError), match=told):
-        await ProcessPool.started(Setup(load, LIMITS, 1, LOG), processes)
-    assert not [child for child in psutil.Process().children() if "worker_process" in " ".join(child.cmdline())]
+    with pytest.raises((LanestreamError, RuntimeError), match=message):
+        await ProcessPool.start(WorkerSetup(load, LIMITS, 1, LOG), processes)
+    assert not [child for child in psutil.Process().children() if "worker_main" in " ".join(child.cmdline())]
 
 
 @pytest.mark.parametrize(
-    ("there", "memory", "provider", "expected"),
+    ("available", "memory", "provider", "expected"),
     [
         (3, None, "cpu", 3),
         (64, None, "openvino", 8),
@@ -188,44 +189,39 @@ async def test_what_can_not_be_loaded_is_told_and_no_process_stays(
         (4, None, "cuda", 1),
     ],
 )
-def test_a_process_for_each_processor_where_there_is_memory(
-    monkeypatch: pytest.MonkeyPatch, there: int, memory: float | None, provider: str, expected: int
+def test_networks_on_the_cpu_get_a_process_for_each_processor_if_there_is_memory(
+    monkeypatch: pytest.MonkeyPatch, available: int, memory: float | None, provider: str, expected: int
 ) -> None:
-    monkeypatch.setattr("lanestream.workers.process_pool.processors", lambda: there)
+    monkeypatch.setattr("lanestream.workers.process_pool.processors", lambda: available)
     monkeypatch.setattr("lanestream.workers.process_pool.memory_limit", lambda: memory)
-    offer = Capabilities.of(fakes.engine().pipelines).chosen()
-    assert (
-        usual_processes(Capabilities([replace(offer, network=replace(offer.network, provider=provider))])) == expected
-    )
+    info = Capabilities.of(fakes.engine()).select()
+    capabilities = Capabilities((replace(info, model=replace(info.model, provider=provider)),))
+    assert default_processes(capabilities) == expected
 
 
-async def test_as_many_processes_as_are_usual(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lanestream.workers.process_pool.usual_processes", lambda _: 3)
-    asked: list[int] = []
-    runner = await ProcessPool.started(Setup(fakes.engine, LIMITS, 1, LOG), None, lambda n: asked.append(n) or 2)
-    assert (len(runner.pids), asked) == (3, [3])
-    await runner.close()
+async def test_the_default_number_of_processes_is_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lanestream.workers.process_pool.default_processes", lambda _: 3)
+    numbers: list[int] = []
+    setup = WorkerSetup(fakes.engine, LIMITS, 1, LOG)
+    pool = await ProcessPool.start(setup, None, lambda number: numbers.append(number) or 2)
+    assert (len(pool.pids), numbers) == (3, [3])
+    await pool.close()
 
 
 async def test_workers_end_with_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with started(fakes.engine, 2) as runner:
-        for pid in runner.pids:
+    async with started(fakes.engine, 2) as pool:
+        for pid in pool.pids:
             for number in (signal.SIGINT, signal.SIGTERM):
                 os.kill(pid, number)
-        assert await lanes(runner, 2), "signals for the whole group are the service's to answer"
-        pids = runner.pids
+        assert await lanes(pool, 2), "signals to the whole process group are handled by the service"
+        pids = pool.pids
     assert not any(psutil.pid_exists(pid) for pid in pids)
 
 
-def test_all_errors_of_ours_travel() -> None:
+def test_every_documented_error_can_be_sent() -> None:
     here, there = socket.socketpair()
     with here, there:
         for code in documented_errors():
-            here.sendall(packed(portable(error_from_code(code, "what was wrong", "what to do"))))
-            error = receive(there)
+            here.sendall(encode_message(portable(error_from_code(code, "what was wrong", "what to do"))))
+            error = receive_message(there)
             assert (error.code, error.message, error.hint) == (code, "what was wrong", "what to do")
-
-
-def test_places() -> None:
-    assert Places.of(1, 3) == Places(all=4, fresh=1, crowd=2)
-    assert Places.of(2, 1) == Places(all=4, fresh=2, crowd=2)

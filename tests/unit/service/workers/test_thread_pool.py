@@ -1,26 +1,30 @@
-"""Frames on their way through the threads, without a service around them."""
+"""Frames in threads, without a service around them."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+import threading
+import time
+from contextlib import AsyncExitStack
 
 import fakes
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lanestream.detection import Detections, Pipeline, Prepared
-from lanestream.engine import Engine
+from lanestream.detection.interface import Detections, FrameContext, Infer
+from lanestream.errors import ExpiredError, NoDetectorError
 from lanestream.images.decoding import ImageLimits
 from lanestream.messages import ProcessedFrame
 from lanestream.road.view import Image
+from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame
+from lanestream.workers.pool import SessionHandle, WorkerPool
 from lanestream.workers.thread_pool import ThreadPool
 
 
-class Counting(fakes.FakeNetwork):
-    """Remembers its batches; answers with their inputs' shades."""
+class CountingModel(fakes.FakeModel):
+    """Returns the shades of its inputs, and records the size of each batch."""
 
     def __init__(self) -> None:
         self.batches: list[int] = []
@@ -30,45 +34,101 @@ class Counting(fakes.FakeNetwork):
         return inputs[:, 0, 0, :2].astype(np.float32)
 
 
-class InParts(fakes.FakeDetector):
-    """Makes its inputs, of three shades, part by part, and checks that the answers come in their order."""
+class ShadeDetector(fakes.FakeDetector):
+    """Asks the model three times, for inputs of different shades, and checks that it gets the outputs of each."""
 
-    def prepare(self, image: Image, *known: Any, **more: Any) -> Prepared:
-        whole = super().prepare(image, *known, **more)
-        parts = tuple(lambda shade=shade: np.full((2, 8, 8, 3), shade, np.uint8) for shade in (10, 20, 30))
-        return Prepared(image, parts, whole.view, (), 1.0)
-
-    def finish(self, prepared: Prepared, outputs: NDArray[np.float32]) -> Detections:
-        assert outputs[:, 0].tolist() == [10, 10, 20, 20, 30, 30]
-        return super().finish(prepared, outputs)
+    def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
+        for shade in (10, 20, 30):
+            outputs = infer("classifier", np.full((2, 8, 8, 3), shade, np.uint8))
+            assert outputs[:, 0].tolist() == [shade, shade]
+        return super().detect(image, context, infer)
 
 
-def run_together(network: Counting, threads: int, cameras: int) -> list[ProcessedFrame]:
-    """One frame of each camera, all at once."""
-    engine = Engine([Pipeline("candidates", InParts(), network)])
-    frame = EncodedFrame(fakes.image_file(), 0.0, 0.0)
+class IdlePool(WorkerPool):
+    """A pool that admits frames and never processes one."""
 
-    async def run() -> list[ProcessedFrame]:
-        runner = ThreadPool(engine, ImageLimits(), threads)
-        frames = await asyncio.gather(*(runner.run(runner.open_camera(), frame) for _ in range(cameras)))
-        await runner.close()
-        return frames
+    def __init__(self, workers: int, threads: int) -> None:
+        super().__init__(Capabilities.of(fakes.engine()), workers, threads, 1)
 
-    return asyncio.run(run())
+    def open_session(self, horizon: float | None = None, detector: str | None = None) -> SessionHandle:
+        raise NotImplementedError
+
+    async def run(self, session: SessionHandle, frame: EncodedFrame) -> ProcessedFrame:
+        raise NotImplementedError
+
+
+def encoded(timestamp: float = 0.0, deadline: float | None = None) -> EncodedFrame:
+    return EncodedFrame(fakes.image_file(), timestamp, time.monotonic(), deadline)
+
+
+async def run_together(model: CountingModel, threads: int, cameras: int) -> list[ProcessedFrame]:
+    """Returns the results of one frame of each camera, all given to the pool at the same time."""
+    pool = ThreadPool(fakes.engine(model, ShadeDetector()), ImageLimits(), threads)
+    frames = await asyncio.gather(*(pool.run(pool.open_session(), encoded()) for _ in range(cameras)))
+    await pool.close()
+    return frames
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_the_answers_are_the_same_in_parts_and_in_one(threads: int) -> None:
-    network = Counting()
-    (alone,) = run_together(network, threads=8, cameras=1)
+async def test_frames_of_many_cameras_have_the_same_lanes_as_a_frame_alone(threads: int) -> None:
+    model = CountingModel()
+    (alone,) = await run_together(model, threads=8, cameras=1)
     curves = [lane.curve for lane in alone.result.lanes]
     assert len(curves) == 2
-    for crowded in run_together(network, threads, cameras=5):
-        assert [lane.curve for lane in crowded.result.lanes] == curves
-    assert sum(network.batches) == 6 * 6
+    for frame in await run_together(model, threads, cameras=5):
+        assert [lane.curve for lane in frame.result.lanes] == curves
+    assert sum(model.batches) == 6 * (3 * 2 + 2), "every input is run once"
 
 
-def test_a_frame_in_a_crowd_asks_all_at_once() -> None:
-    network = Counting()
-    run_together(network, threads=1, cameras=4)
-    assert network.batches == [6] * 4
+async def test_a_frame_has_the_duration_of_each_stage_which_add_up_to_its_total() -> None:
+    pool = ThreadPool(fakes.engine(), ImageLimits(), 1)
+    frame = await pool.run(pool.open_session(), encoded())
+    await pool.close()
+    timing = frame.result.timing_ms
+    assert set(timing) == {"decode", "propose", "infer", "fit", "track", "queue", "total"}
+    assert min(timing.values()) >= 0.0
+    assert sum(timing.values()) - timing["total"] == pytest.approx(timing["total"], abs=1e-6)
+
+
+async def test_an_expired_frame_is_never_run_and_leaves_the_session_as_it_was() -> None:
+    model = CountingModel()
+    pool = ThreadPool(fakes.engine(model), ImageLimits(), 1)
+    session = pool.open_session()
+    before = session.state
+    with pytest.raises(ExpiredError):
+        await pool.run(session, encoded(deadline=time.monotonic() - 1.0))
+    await pool.close()
+    assert model.batches == []
+    assert session.state == before
+
+
+async def test_a_detector_that_is_missing_is_an_error() -> None:
+    pool = ThreadPool(fakes.engine(), ImageLimits(), 1)
+    with pytest.raises(NoDetectorError, match="there is no detector regression here"):
+        pool.open_session(detector="regression")
+    assert (pool.works, pool.pids) == (True, ())
+    await pool.close()
+
+
+async def test_functions_run_in_a_thread_of_the_pool() -> None:
+    pool = ThreadPool(fakes.engine(), ImageLimits(), 1)
+    name, numbers = await pool.in_thread(
+        lambda *args, **kwargs: (threading.current_thread().name, [args, kwargs]), 1, b=2
+    )
+    await pool.close()
+    assert name.startswith("lanestream-frames")
+    assert numbers == [(1,), {"b": 2}]
+
+
+@pytest.mark.parametrize(("workers", "threads", "slots", "latest_slots"), [(1, 3, 4, 1), (2, 1, 4, 2), (1, 8, 9, 6)])
+async def test_a_pool_admits_one_frame_more_than_its_threads_and_fewer_of_mode_latest(
+    workers: int, threads: int, slots: int, latest_slots: int
+) -> None:
+    for latest, expected in ((False, slots), (True, latest_slots)):
+        pool = IdlePool(workers, threads)
+        async with AsyncExitStack() as stack:
+            for _ in range(expected):
+                await stack.enter_async_context(pool.admit(latest=latest))
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(stack.enter_async_context(pool.admit(latest=latest)), 0.05)
+        await pool.close()

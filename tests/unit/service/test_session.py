@@ -1,0 +1,153 @@
+"""One camera's session: what it tells the detector, its horizon, its timing, and that its state restores it exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import fakes
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lanestream.detection.interface import Detections, FrameContext, Infer, ModelRole
+from lanestream.engine import load_engine
+from lanestream.errors import ExpiredError
+from lanestream.road.results import FrameResult
+from lanestream.road.view import Image
+from lanestream.session import Session
+from lanestream_exporter.scenes import Drive, render_clip, sample_clip
+
+
+def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.zeros((len(inputs), 2), np.float32)
+
+
+def expire(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+    raise ExpiredError()
+
+
+@dataclass
+class ScriptedDetector(fakes.FakeDetector):
+    """Finds the fake boundaries below the horizons of a script, and records what it is told of each frame."""
+
+    horizons: list[tuple[float, float]]  # of each frame: the row as a share of the height, and its weight
+    prior_horizon: float | None = None
+    contexts: list[FrameContext] = field(default_factory=list)
+    sizes: list[tuple[int, int]] = field(default_factory=list)
+
+    def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
+        self.contexts.append(context)
+        self.sizes.append(image.shape[:2])
+        share, weight = self.horizons.pop(0)
+        found = super().detect(image, FrameContext(share * len(image)), infer)
+        return replace(found, horizon_weight=weight, prior_horizon=self.prior_horizon)
+
+
+def test_a_detector_gets_a_working_image_of_640_columns() -> None:
+    detector = ScriptedDetector([(0.4, 1.0)] * 3)
+    for width, height in ((320, 180), (640, 360), (1920, 1200)):
+        result = Session(detector).process(fakes.picture(width, height), 0.0, infer)
+        assert result.horizon == pytest.approx(0.4 * height, abs=2.0), "the result is in pixels of the image"
+    assert detector.sizes == [(360, 640), (360, 640), (400, 640)]
+
+
+def test_a_detector_is_told_what_the_last_frame_showed() -> None:
+    detector = ScriptedDetector([(0.4, 1.0)] * 2, prior_horizon=150.0)
+    session = Session(detector)
+    for timestamp in (0.0, 0.04):
+        session.process(fakes.picture(640, 360), timestamp, infer)
+    first, second = detector.contexts
+    assert first == FrameContext()
+    assert second.horizon == pytest.approx(144.0)
+    assert second.prior_horizon == pytest.approx(150.0)
+    assert second.tracked is not None
+    columns = second.tracked.x(np.array([359.0]))[:, 0]
+    assert columns == pytest.approx([319.5 - 1.15 * 215.0, 319.5 + 1.15 * 215.0], abs=1.0)
+
+
+def test_a_configured_horizon_stays() -> None:
+    detector = ScriptedDetector([(0.5, 1.0)] * 3)
+    session = Session(detector, horizon=0.3)
+    for i in range(3):
+        session.process(fakes.picture(640, 360), 0.04 * i, infer)
+    assert [context.horizon for context in detector.contexts] == [pytest.approx(108.0)] * 3
+
+
+def test_the_horizon_is_smoothed_and_follows_slowly() -> None:
+    detector = ScriptedDetector([(0.4, 1.0), (0.5, 1.0), (0.9, 0.0), *[(0.5, 1.0)] * 60])
+    session = Session(detector)
+    for i in range(63):
+        session.process(fakes.picture(640, 360), 0.04 * i, infer)
+    shares = [context.horizon / 360.0 for context in detector.contexts if context.horizon is not None]
+    assert shares[:3] == pytest.approx([0.4, 0.45, 0.45]), "the mean so far; a frame without a weight says nothing"
+    assert shares[-1] == pytest.approx(0.5, abs=0.01)
+    assert all(later >= earlier for earlier, later in pairwise(shares))
+
+
+def test_another_size_resets_the_tracker() -> None:
+    detector = ScriptedDetector([(0.4, 1.0), (0.4, 1.0), (0.5, 1.0), (0.5, 1.0)], prior_horizon=150.0)
+    session = Session(detector)
+    for i in range(2):
+        session.process(fakes.picture(640, 360), 0.04 * i, infer)
+    result = session.process(fakes.picture(640, 480), 0.08, infer)
+    session.process(fakes.picture(640, 480), 0.12, infer)
+    assert [lane.age_s for lane in result.lanes] == [0.0, 0.0]
+    assert detector.contexts[2].tracked is None
+    assert detector.contexts[2].prior_horizon is None
+    assert detector.contexts[3].horizon == pytest.approx(0.5 * 480), "the horizon of another size is forgotten"
+
+
+def test_a_failed_frame_leaves_the_session_as_it_was() -> None:
+    session = Session(fakes.FakeDetector())
+    session.process(fakes.picture(), 0.0, infer)
+    before = session.state
+    with pytest.raises(ExpiredError):
+        session.process(fakes.picture(320, 240), 0.04, expire)
+    with pytest.raises(RuntimeError, match="the detector failed"):
+        session.process(np.full((180, 320, 3), 255, np.uint8), 0.04, infer)
+    assert session.state == before
+
+
+def test_timing_has_the_stages_without_the_wait_for_the_models() -> None:
+    def slow(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        fakes.pause(0.05)
+        return infer(role, inputs)
+
+    timing = Session(fakes.FakeDetector()).process(fakes.picture(), 0.0, slow).timing_ms
+    assert set(timing) == {"propose", "fit", "track"}
+    assert 0.0 <= timing["propose"] < 50.0
+
+
+def exact(result: FrameResult) -> list[object]:
+    """Returns all numbers of a result bit for bit, without timing."""
+    lanes = [(replace(lane, covariance=None), lane.covariance.tobytes()) for lane in result.lanes]  # type: ignore[arg-type]
+    return [lanes, result.ego, result.horizon, result.events]
+
+
+@pytest.mark.parametrize("detector", ["candidates", "regression"])
+def test_a_restored_session_gives_the_same_results_bit_for_bit(detector: str) -> None:
+    clip = sample_clip(np.random.default_rng(24), 640, 360, frames=12, fps=25.0, drive=Drive("highway", fair=True))
+    images = [frame.image for frame in render_clip(clip)]
+    engine = load_engine(provider="cpu")
+    original = engine.open_session(detector=detector)
+    for i, image in enumerate(images):
+        # As worker processes do: a new session for each frame, which gets the state of the last one.
+        restored = engine.open_session(detector=detector)
+        restored.restore(original.state)
+        assert restored.state == original.state
+        results = [engine.process(session, image, 0.04 * i) for session in (original, restored)]
+        assert exact(results[0]) == exact(results[1])
+        assert restored.state == original.state
+    assert len(results[0].lanes) >= 2
+
+
+def test_an_invalid_state_leaves_the_session_as_it_was() -> None:
+    session = Session(fakes.FakeDetector())
+    session.process(fakes.picture(), 0.0, infer)
+    before = session.state
+    (first, *others) = before.tracker.tracks
+    tracks = (replace(first, filter="AAAA"), *others)
+    with pytest.raises(ValueError, match="buffer size"):
+        session.restore(replace(before, tracker=replace(before.tracker, tracks=tracks)))
+    assert session.state == before
