@@ -37,6 +37,9 @@ _COMPARED: Final = np.array([0.25, 0.5, 1.0])
 # marking is the mean of those that are nowhere farther apart than the second, measured across the line.
 _SAME: Final = 0.12
 _AVERAGED: Final = 0.25
+# A boundary of the prior is fitted to the paint to become a candidate if no tracked one, which already is on the paint,
+# is this near, in row offsets.
+_TRACKED: Final = 0.16
 # hypot(1, slope) of an ego boundary, see `curve_fit`.
 _USUAL_OBLIQUITY: Final = 1.6
 # Of two boundaries that come closer than this, in row offsets, or that cross, one is wrong.
@@ -68,11 +71,10 @@ class CandidateDetector:
         horizon = context.horizon if context.prior_horizon is None else context.prior_horizon
         output, view = self.regressor.predict(image, horizon, infer)
         prior = self.regressor.prior(output, view)
-        # Tracked boundaries are on the paint already.
-        curves = output.curves(view)
         sides: Sequence[int] = (0, 1)
         if context.tracked is not None:
-            sides = np.flatnonzero(~are_duplicates(curves, context.tracked, view).any(axis=1)).tolist()
+            is_tracked = are_duplicates(output.curves(view), context.tracked, view, _TRACKED)
+            sides = np.flatnonzero(~is_tracked.any(axis=1)).tolist()
         _, fits = fit_output(gray, output, view, self.regressor.threshold, sides)
         return propose(gray, context, prior, fits.curves, limit)
 

@@ -116,16 +116,19 @@ def _find_vanishing_point(gray: Image, context: FrameContext, prior: EgoPrior | 
     return VanishingPoint(point.x, min(point.y, _LOWEST_HORIZON * height), point.k, point.weight), ridges
 
 
-def are_duplicates(curves: Curves, others: Curves, view: RoadView) -> NDArray[np.bool_]:
-    """Returns for each curve (N, M) which of the `others` follow the same marking: they are near it at both rows.
+def are_duplicates(
+    curves: Curves, others: Curves, view: RoadView, separation: float = _SEPARATION
+) -> NDArray[np.bool_]:
+    """Returns for each curve (N, M) which of the `others` are nearer than `separation`, in row offsets, at two rows.
 
-    Oblique lines are closer together than their columns are apart, so distances are measured across the other line.
+    By default that is near enough to follow the same marking. Oblique lines are closer together than their columns are
+    apart, so distances are measured across the other line.
     """
     below = _COMPARED * view.depth
     rows = view.horizon + below
     columns = others.x(rows)
     slope = (columns[:, 0] - columns[:, 1]) / (below[0] - below[1])
-    limit = _SEPARATION * below * np.hypot(1.0, slope)[:, None]
+    limit = separation * below * np.hypot(1.0, slope)[:, None]
     return np.asarray((np.abs(curves.x(rows)[:, None] - columns) < limit).all(axis=2))
 
 
