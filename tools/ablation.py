@@ -310,7 +310,7 @@ def main(folder: Path, data: Path | None, path: Path, only: tuple[str, ...]) -> 
             path.write_text(json.dumps(results), encoding="utf-8")
     results = {name: results[name] for name in STAGES if name in results}
     for title, wanted in (
-        ("All frames", lambda group: True),  # noqa: ARG005
+        ("All frames", lambda group: True),
         ("Real frames", lambda group: not group.startswith("rendered")),
         ("Rendered frames", lambda group: group.startswith("rendered")),
     ):
