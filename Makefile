@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: bench soak evaluate proposals models demo serve train-toy test lint asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: bench soak evaluate ablation models demo serve train-toy test lint asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -40,6 +40,7 @@ lint: $(DEV_READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 MODELS := service/lanestream/models
 
@@ -61,8 +62,9 @@ evaluate: $(DEV_READY)
 	  --out out --json out/evaluation.json
 	$(BIN)/python tools/evaluation_tables.py out/evaluation.json
 
-proposals: $(DEV_READY)
-	$(BIN)/python tools/proposals.py --split test --json out/proposals.json
+# Leaves out each stage of the candidate detector once; results are kept in out/, so that it can be interrupted.
+ablation: $(DEV_READY)
+	$(BIN)/python tools/ablation.py
 
 # Compares with LitServe, too, if it is installed: .venv/bin/pip install -e '.[bench-litserve]'
 bench: $(DEV_READY)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from lanestream.api.auth import Authenticator
 from lanestream.api.metrics import Metrics
@@ -13,10 +13,9 @@ from lanestream.api.request_body import BodyReader
 from lanestream.errors import DrainingError, NotReadyError
 from lanestream.protocol import Limits
 from lanestream.streaming.session_registry import SessionRegistry
-from lanestream.streaming.store import open_store
+from lanestream.streaming.stores import open_store
 
 if TYPE_CHECKING:
-    from lanestream.api.websocket import StreamConnection
     from lanestream.protocol import LanesMessage
     from lanestream.road.view import Image
     from lanestream.settings import Settings
@@ -25,6 +24,13 @@ if TYPE_CHECKING:
 DrawLanes = Callable[["Image", "LanesMessage"], "Image"]
 
 _DRAIN_POLL_S: Final = 0.02
+
+
+class OpenStream(Protocol):
+    """An open stream, as the service sees it."""
+
+    def wake(self) -> None:
+        """Makes the stream check whether the service is draining."""
 
 
 class Service:
@@ -40,7 +46,7 @@ class Service:
         self.authenticator = Authenticator.from_settings(settings)
         self.metrics = Metrics()
         self.bodies = BodyReader(settings.max_bytes, settings.max_sessions, settings.body_s)
-        self.streams: set[StreamConnection] = set()
+        self.streams: set[OpenStream] = set()
         self.draining = False
         redis_url = settings.redis_url
         self._store = open_store(None if redis_url is None else redis_url.get_secret_value())

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.interface import Infer
-from lanestream.detection.vanishing_point import VanishingPoint
 from lanestream.images.resizing import resized
 from lanestream.road.crops import RoadCropGeometry
-from lanestream.road.curve import Curves, FloatArray
+from lanestream.road.curve import Curves, FloatArray, VanishingPoint
 from lanestream.road.view import USUAL_LANE_WIDTH, Image, RoadView, Scaling
 
 # The regressor gives columns at these shares of the depth below the horizon.

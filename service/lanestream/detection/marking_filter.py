@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.road.curve import FloatArray
+from lanestream.road.curve import FloatArray, VanishingPoint
 from lanestream.road.view import Image
-
-if TYPE_CHECKING:
-    from lanestream.detection.vanishing_point import VanishingPoint
 
 # The unrolled road: lateral positions up to this far on both sides in steps of STEP, on ROWS rows from TOP_SHARE of the
 # depth down to the bottom. Lateral positions are in columns per row offset: meters over the camera's height.

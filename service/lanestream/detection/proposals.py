@@ -17,12 +17,11 @@ from lanestream.detection.vanishing_point import (
     KNOWN_HORIZON,
     NEAR_PRIOR,
     WIDE,
-    VanishingPoint,
     find_lines,
     refine,
     vote_of_lines,
 )
-from lanestream.road.curve import Curves
+from lanestream.road.curve import Curves, VanishingPoint
 from lanestream.road.view import Image, RoadView, Spans, visible_spans
 
 # The most candidates of a frame, and of one in which boundaries are tracked: those come first, so fewer are needed.

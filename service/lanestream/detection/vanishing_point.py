@@ -17,39 +17,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection.hough import HoughLines
 from lanestream.detection.marking_filter import REACH, STEP, Ridges
-from lanestream.road.curve import Curves, FloatArray
-
-
-@dataclass(frozen=True)
-class VanishingPoint:
-    """The vanishing point (`x`, `y`) and the curvature term `k` of the road, in pixels.
-
-    `weight` (0 to 1) is the share of the frame's lines that supports it.
-    """
-
-    x: float
-    y: float
-    k: float = 0.0
-    weight: float = 0.0
-
-    def columns(self, places: FloatArray, rows: FloatArray) -> FloatArray:
-        """Returns the columns (R, P) of boundaries with the lateral positions b = `places` (P,) at `rows` (R,)."""
-        u = np.maximum(rows - self.y, 1.0)[:, None]
-        columns: FloatArray = (self.x + self.k / u) + u * places
-        return columns
-
-    def places(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
-        """Returns the lateral positions b (N,) of the boundaries through the points (`columns`, `rows`), each (N,)."""
-        u = np.maximum(rows - self.y, 1.0)
-        places: FloatArray = (columns - self.x - self.k / u) / u
-        return places
-
-    def curves(self, places: FloatArray) -> Curves:
-        """Returns the boundaries with the lateral positions b = `places` (N,)."""
-        coefficients = np.empty((len(places), 3))
-        coefficients[:, 0], coefficients[:, 1], coefficients[:, 2] = self.x, places, self.k
-        return Curves(self.y, coefficients)
-
+from lanestream.road.curve import FloatArray, VanishingPoint
 
 # --- From Hough lines, if nothing else says where the road vanishes -------------------------------------------------
 

@@ -118,6 +118,37 @@ class Curves:
         return Curves.through(horizon, rows, self.x(rows))
 
 
+@dataclass(frozen=True)
+class VanishingPoint:
+    """What all boundaries of a road share: their vanishing point (`x`, `y`) and curvature term `k`, in pixels.
+
+    `weight` (0 to 1) is the share of the frame's lines that supports it.
+    """
+
+    x: float
+    y: float
+    k: float = 0.0
+    weight: float = 0.0
+
+    def columns(self, places: FloatArray, rows: FloatArray) -> FloatArray:
+        """Returns the columns (R, P) of boundaries with the lateral positions b = `places` (P,) at `rows` (R,)."""
+        u = np.maximum(rows - self.y, 1.0)[:, None]
+        columns: FloatArray = (self.x + self.k / u) + u * places
+        return columns
+
+    def places(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
+        """Returns the lateral positions b (N,) of the boundaries through the points (`columns`, `rows`), each (N,)."""
+        u = np.maximum(rows - self.y, 1.0)
+        places: FloatArray = (columns - self.x - self.k / u) / u
+        return places
+
+    def curves(self, places: FloatArray) -> Curves:
+        """Returns the boundaries with the lateral positions b = `places` (N,)."""
+        coefficients = np.empty((len(places), 3))
+        coefficients[:, 0], coefficients[:, 1], coefficients[:, 2] = self.x, places, self.k
+        return Curves(self.y, coefficients)
+
+
 def curve_basis(horizon: float, rows: FloatArray) -> FloatArray:
     """Returns d x / d (v, b, k) at `rows` (...,) as an array (..., 3)."""
     u = _row_offset(horizon, rows)

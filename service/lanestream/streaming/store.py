@@ -3,7 +3,7 @@
 A stored session has one owner at a time. Taking it over makes the caller its owner, and the previous owner can't write
 it any more: a replica that has not noticed yet that its socket was evicted can do no harm.
 
-To add a store, implement `SessionStore` in a module of its own and select it in `open_store`.
+To add a store, implement `SessionStore` in a module of its own and select it in `stores.py`.
 """
 
 from __future__ import annotations
@@ -45,16 +45,6 @@ class SessionStore(Protocol):
     async def close(self) -> None:
         """Closes connections."""
         ...
-
-
-def open_store(redis_url: str | None) -> SessionStore:
-    """Returns the store at a URL; None keeps sessions in this process. Raises SettingsError for an invalid URL."""
-    if redis_url is None:
-        return MemoryStore()
-    # The redis package is an optional extra, needed by replicated services only.
-    from lanestream.streaming.redis_store import RedisStore
-
-    return RedisStore(redis_url)
 
 
 class MemoryStore:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from lanestream.detection.commonroad import Agreement, Boundaries, CommonRoad
+
 from lanestream.road.curve import Curve, FloatArray, curve_columns
 
 HORIZON, DEPTH = 200.0, 400.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from lanestream.detection.lattice import LaneSpacing
 
 from lanestream.detection.ego_prior import EgoPrior, PriorBoundary
-from lanestream.detection.lattice import LaneSpacing
 from lanestream.detection.proposals import CandidateSearch
 from lanestream.road.curve import Curve
 from lanestream.road.view import Image, RoadView

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lanestream.detection.fan import Fan
+from lanestream.detection.perspective import Perspective, PerspectiveSearch
 from numpy.typing import NDArray
 
-from lanestream.detection.fan import Fan
 from lanestream.detection.marking_filter import RidgeSearch
-from lanestream.detection.perspective import Perspective, PerspectiveSearch
 
 WIDTH, HEIGHT = 640, 360
 BOTTOM = HEIGHT - 1.0

@@ -11,7 +11,8 @@ from redisserver import redis_server
 
 from lanestream.errors import SettingsError, StoreError
 from lanestream.streaming.redis_store import RedisStore
-from lanestream.streaming.store import MemoryStore, SessionStore, StoredSession, open_store
+from lanestream.streaming.store import MemoryStore, SessionStore, StoredSession
+from lanestream.streaming.stores import open_store
 
 
 @pytest.fixture(scope="module")
