@@ -1,62 +1,98 @@
-"""Ridges and the lines along which they gather, on drawn roads whose perspective is known."""
+"""Ridges, the vanishing point at which they gather, and lines through it, on drawn roads of known perspective."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from lanestream.detection.fan import Fan
-from lanestream.detection.perspective import Perspective, PerspectiveSearch
 from numpy.typing import NDArray
 
-from lanestream.detection.marking_filter import RidgeSearch
+from lanestream.detection.features import find_edges
+from lanestream.detection.hough import hough_lines
+from lanestream.detection.marking_filter import bar_contrast, find_ridges
+from lanestream.detection.vanishing_point import SearchRange, find_lines, refine, vote_of_lines
+from lanestream.road.curve import VanishingPoint
 
 WIDTH, HEIGHT = 640, 360
 BOTTOM = HEIGHT - 1.0
-SLOPES = (-1.2, 1.1)
+PLACES = (-1.2, 1.1)
 
 
-def drawn_road(point: Perspective, dash: float = 1.0) -> NDArray[np.uint8]:
-    """Markings with the bottom `SLOPES`, 0.1 of the depth wide; of every 40 rows the share `dash` is painted."""
+def point(x: float, y: float, curvature: float = 0.0) -> VanishingPoint:
+    """Returns a vanishing point; `curvature` is in depths."""
+    return VanishingPoint(x, y, curvature * (BOTTOM - y) ** 2, 1.0)
+
+
+def drawn_road(vanishing: VanishingPoint, painted: float = 1.0) -> NDArray[np.uint8]:
+    """Returns markings at `PLACES`, 0.1 row offsets wide; of every 40 rows the share `painted` has paint."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    below = np.maximum(y - point.y, 1.0)
-    across = (x - point.x - point.k(BOTTOM) / below) / below
-    marked = np.any([np.abs(across - slope) <= 0.05 for slope in SLOPES], axis=0)
-    painted = marked & (y > point.y + 2.0) & (y % 40.0 < 40.0 * dash)
-    return np.where(painted, 210, 80).astype(np.uint8)
+    below = np.maximum(y - vanishing.y, 1.0)
+    across = (x - vanishing.x - vanishing.k / below) / below
+    marked = np.any([np.abs(across - place) <= 0.05 for place in PLACES], axis=0)
+    has_paint = marked & (y > vanishing.y + 2.0) & (y % 40.0 < 40.0 * painted)
+    return np.where(has_paint, 210, 80).astype(np.uint8)
 
 
-@pytest.mark.parametrize("bend", [0.0, 0.03, -0.03])
-@pytest.mark.parametrize("dash", [1.0, 0.3])
-def test_ridges_gather_along_markings(bend: float, dash: float) -> None:
-    point = Perspective(300.0, 150.0, bend, 1.0)
-    ridges = RidgeSearch().find(drawn_road(point, dash), point)
+@pytest.mark.parametrize("curvature", [0.0, 0.03, -0.03])
+@pytest.mark.parametrize("painted", [1.0, 0.3])
+def test_ridges_gather_along_markings(curvature: float, painted: float) -> None:
+    vanishing = point(300.0, 150.0, curvature)
+    ridges = find_ridges(drawn_road(vanishing, painted), vanishing)
     assert (np.diff(ridges.weight) <= 0.0).all()
-    strongest = Fan().lines(ridges, point, WIDTH, BOTTOM).slope[:2]
-    np.testing.assert_allclose(np.sort(strongest), SLOPES, atol=0.021)
+    lines = find_lines(ridges, vanishing, WIDTH)
+    assert (np.diff(lines.strength) <= 0.0).all()
+    np.testing.assert_allclose(np.sort(lines.places[:2]), PLACES, atol=0.021)
 
 
 def test_a_road_without_markings_has_no_ridges() -> None:
-    point = Perspective(300.0, 150.0, 0.0, 1.0)
-    ridges = RidgeSearch().find(np.full((HEIGHT, WIDTH), 90, np.uint8), point)
+    vanishing = point(300.0, 150.0)
+    ridges = find_ridges(np.full((HEIGHT, WIDTH), 90, np.uint8), vanishing)
     assert len(ridges.x) == 0
-    assert len(Fan().lines(ridges, point, WIDTH, BOTTOM).slope) == 0
+    assert len(find_lines(ridges, vanishing, WIDTH).places) == 0
+    assert refine(vanishing, ridges, WIDTH, BOTTOM, SearchRange(0.1, 0.1, 0.1, 100, ((3, 1.0),))) == vanishing
 
 
-def test_the_perspective_moves_to_where_ridges_gather() -> None:
-    truth = Perspective(310.0, 152.0, 0.02, 1.0)
-    guess = Perspective(300.0, 150.0, 0.0, 1.0)
-    found = PerspectiveSearch(spread_x=0.03, nod=0.01, spread_bend=0.03).refine(
-        guess, RidgeSearch().find(drawn_road(truth), guess), WIDTH, BOTTOM, known=True
-    )
-    rows, slopes = np.array([200.0, 260.0, 340.0]), np.array(SLOPES)
-    missed = found.columns(slopes, rows, BOTTOM) - truth.columns(slopes, rows, BOTTOM)
-    before = guess.columns(slopes, rows, BOTTOM) - truth.columns(slopes, rows, BOTTOM)
-    assert np.abs(missed - missed.mean(axis=0)).max() < 0.5 * np.abs(before - before.mean(axis=0)).max()
+def test_the_vanishing_point_moves_to_where_ridges_gather() -> None:
+    truth, guess = point(310.0, 152.0, 0.02), point(300.0, 150.0)
+    search = SearchRange(0.03, 0.01, 0.03, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
+    found = refine(guess, find_ridges(drawn_road(truth), guess), WIDTH, BOTTOM, search)
+    rows, places = np.array([200.0, 260.0, 340.0]), np.array(PLACES)
+    error = found.columns(places, rows) - truth.columns(places, rows)
+    before = guess.columns(places, rows) - truth.columns(places, rows)
+    # A shift of all rows is another place, so only what differs between the rows is an error.
+    assert np.abs(error - error.mean(axis=0)).max() < 0.5 * np.abs(before - before.mean(axis=0)).max()
 
 
-def test_slopes_and_columns_are_each_others_inverse() -> None:
-    point = Perspective(310.0, 152.0, 0.02, 1.0)
-    rows = np.array([170.0, 260.0, 359.0])
-    columns = point.columns(np.array([-1.5, 0.0, 2.0]), rows, BOTTOM)
-    for i, slope in enumerate((-1.5, 0.0, 2.0)):
-        np.testing.assert_allclose(point.slopes(columns[:, i], rows, BOTTOM), slope, atol=1e-9)
+@pytest.mark.parametrize("known", [True, False])
+def test_hough_lines_meet_at_the_vanishing_point(known: bool) -> None:
+    truth = point(330.0, 160.0)
+    lines = hough_lines(find_edges(drawn_road(truth), 150), WIDTH, BOTTOM)
+    found = vote_of_lines(lines, WIDTH, HEIGHT, 160.0 if known else None)
+    assert (found.x, found.y) == pytest.approx((330.0, 160.0), abs=4.0)
+    assert found.weight > 0.5
+
+
+def test_without_lines_the_vanishing_point_is_the_usual_one() -> None:
+    nothing = hough_lines(find_edges(np.full((HEIGHT, WIDTH), 90, np.uint8), 0), WIDTH, BOTTOM)
+    usual = vote_of_lines(nothing, WIDTH, HEIGHT)
+    assert (usual.x, usual.weight) == (319.5, 0.0)
+    assert 0.4 * HEIGHT < usual.y < 0.5 * HEIGHT
+    assert vote_of_lines(nothing, WIDTH, HEIGHT, 120.0).y == 120.0
+
+
+def test_places_and_columns_are_inverse() -> None:
+    vanishing = point(310.0, 152.0, 0.02)
+    rows, places = np.array([170.0, 260.0, 359.0]), np.array([-1.5, 0.0, 2.0])
+    columns = vanishing.columns(places, rows)
+    for i, place in enumerate(places.tolist()):
+        np.testing.assert_allclose(vanishing.places(columns[:, i], rows), place, atol=1e-9)
+    np.testing.assert_allclose(vanishing.curves(places).x(rows), columns.T, atol=1e-9)
+
+
+def test_a_bar_has_the_contrast_to_its_brighter_side() -> None:
+    row = np.full((1, 60), 50, np.uint8)
+    row[0, 20:25], row[0, 25:] = 150, 90
+    contrast = bar_contrast(row, [5])[0]
+    assert contrast.argmax() == 22
+    assert contrast[22] == pytest.approx(60.0)
+    assert contrast[50] == 0.0
+    np.testing.assert_array_equal(bar_contrast(row, [5, 9])[0], np.maximum(contrast, bar_contrast(row, [9])[0]))
