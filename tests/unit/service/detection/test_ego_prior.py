@@ -1,83 +1,159 @@
-"""What a glance at the road says of places, and how the detector judges candidates by it."""
+"""The ego-lane prior: the odds that it gives, the lanes beside the ego lane, and how the detector uses it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
+import roads
 
-from lanestream.detection import Prepared
 from lanestream.detection.candidate_detector import CandidateDetector
-from lanestream.detection.ego_prior import EgoPrior, PriorBoundary
-from lanestream.road.curve import Curve
-from lanestream.road.results import Candidate, Detection
-from lanestream.road.view import RoadView
+from lanestream.detection.ego_prior import EgoPrior, LaneSpacing
+from lanestream.detection.features import paint_gray
+from lanestream.detection.interface import FrameContext
+from lanestream.detection.proposals import Proposals, propose
+from lanestream.road.curve import Curve, Curves
+from lanestream.road.results import Detection
+from lanestream.road.view import Image, RoadView, visible_spans
 
 VIEW = RoadView(640, 360, 150.0)
 
 
-def line(slope: float) -> Curve:
-    """A straight boundary that crosses the bottom row `slope` depths right of the middle."""
-    return Curve(150.0, (320.0, slope, 0.0))
+def lines(*places: float) -> Curves:
+    """Returns straight boundaries that cross the bottom row so many depths right of the middle."""
+    return Curves(150.0, np.array([[320.0, place, 0.0] for place in places]).reshape(-1, 3))
 
 
-def seen(slope: float, spread: float = 0.05, presence: float = 0.98) -> PriorBoundary:
-    return PriorBoundary(line(slope), np.full(2, spread), presence)
+def prior_at(left: float | None, right: float | None, sigma: float = 0.05, presence: float = 0.98) -> EgoPrior:
+    seen = {side: place for side, place in ((-1, left), (1, right)) if place is not None}
+    number = len(seen)
+    return EgoPrior(VIEW, tuple(seen), lines(*seen.values()), np.full((number, 2), sigma), np.full(number, presence))
 
 
-def test_boundaries_are_likelier_where_they_were_seen_and_hardly_possible_within_the_lane() -> None:
-    odds = EgoPrior(VIEW, seen(-1.2), seen(1.2)).odds([line(b) for b in (-1.2, 1.2, 0.0)])
+def test_boundaries_are_likelier_where_the_prior_saw_them_and_hardly_possible_in_the_lane() -> None:
+    odds = prior_at(-1.2, 1.2).odds(lines(-1.2, 1.2, 0.0))
     assert odds[0] == pytest.approx(odds[1])
     assert odds[0] > 10.0
     assert odds[2] < 0.01
 
 
 def test_lanes_repeat_outside_the_ego_lane() -> None:
-    next_lane, between = EgoPrior(VIEW, seen(-1.2), seen(1.2)).odds([line(3.6), line(2.4)])
+    prior = prior_at(-1.2, 1.2)
+    next_lane, between = prior.odds(lines(3.6, 2.4))
     assert next_lane > 1.0
-    # Half a lane beside the ego lane stand walls and kerbs: a line there needs a surer word.
+    # Half a lane outside the ego lane are walls and curbs: a line there must be more probable.
     assert between == pytest.approx(0.075, rel=0.05)
-    assert len(found(EgoPrior(VIEW, seen(-1.2), seen(1.2)), {-1.2: 0.9, 1.2: 0.9, 2.4: 0.9, 3.6: 0.9})) == 3
-    assert len(found(EgoPrior(VIEW, seen(-1.2), seen(1.2)), {-1.2: 0.9, 1.2: 0.9, 2.4: 0.97})) == 3
+    assert len(decided(prior, {-1.2: 0.9, 1.2: 0.9, 2.4: 0.9, 3.6: 0.9})) == 3
+    assert len(decided(prior, {-1.2: 0.9, 1.2: 0.9, 2.4: 0.97})) == 3
 
 
-def test_a_glance_that_doubts_says_less() -> None:
-    places = [line(b) for b in (1.2, 0.0)]
-    sure, unsure = (EgoPrior(VIEW, seen(-1.2, s), seen(1.2, s)).odds(places) for s in (0.05, 0.4))
-    assert 1.0 < unsure[0] < sure[0]
-    assert sure[1] < unsure[1] < 1.0
+def test_an_uncertain_prior_changes_odds_less() -> None:
+    certain, uncertain = (prior_at(-1.2, 1.2, sigma).odds(lines(1.2, 0.0)) for sigma in (0.05, 0.4))
+    assert 1.0 < uncertain[0] < certain[0]
+    assert certain[1] < uncertain[1] < 1.0
 
 
-def test_one_boundary_alone_tells_nothing_of_a_lane() -> None:
-    odds = EgoPrior(VIEW, seen(-1.2), None).odds([line(b) for b in (-1.2, 0.0, 1.2)])
+def test_a_boundary_that_is_less_present_has_lower_odds() -> None:
+    present, absent = (prior_at(-1.2, 1.2, presence=presence).odds(lines(1.2))[0] for presence in (0.98, 0.3))
+    assert 1.0 < absent < present
+
+
+def test_one_boundary_alone_says_nothing_of_the_lane() -> None:
+    odds = prior_at(-1.2, None).odds(lines(-1.2, 0.0, 1.2))
     assert odds[0] > 10.0
     assert odds[1:] == pytest.approx(1.0, abs=0.02)
-    assert EgoPrior(VIEW, None, None).odds([line(0.0)]) == pytest.approx(1.0)
+    assert prior_at(None, None).odds(lines(0.0)) == pytest.approx(1.0)
 
 
-def found(prior: EgoPrior | None, said: dict[float, float]) -> tuple[Detection, ...]:
-    """What a detector makes of lines on a grey road, which the classifier gives these probabilities by their slope."""
-    detector = CandidateDetector()
-    candidates = tuple(Candidate(line(slope), 171.0, 359.0, 1.0) for slope in said)
-    grey = np.full((360, 640, 3), 90, np.uint8)
-    outputs = np.array([[1.0 - p, p] for p in said.values()], np.float32)
-    return detector.finish(replace(Prepared(grey, (), VIEW, candidates), prior=prior), outputs).detections
+def decided(prior: EgoPrior | None, probabilities: Mapping[float, float]) -> tuple[Detection, ...]:
+    """Returns the boundaries on a gray road if the classifier gives these probabilities to lines at these places."""
+    curves = lines(*probabilities)
+    outputs = np.array([[1.0 - p, p] for p in probabilities.values()], np.float32)
+    proposals = Proposals(curves, visible_spans(curves, VIEW), VIEW, 1.0, prior)
+    return CandidateDetector(0.5).decide(np.full((360, 640), 90, np.uint8), proposals, outputs).boundaries
 
 
-def slopes(detections: tuple[Detection, ...]) -> list[float]:
-    return [float(d.curve.coefficients[1]) for d in detections]
+def places(detections: tuple[Detection, ...]) -> list[float]:
+    return [detection.curve.coefficients[1] for detection in detections]
 
 
-def test_what_the_classifier_takes_for_a_boundary_within_the_lane_is_none() -> None:
-    said = {-1.2: 0.95, 0.0: 0.95, 1.2: 0.95}
-    assert slopes(found(None, said)) == pytest.approx([-1.2, 0.0, 1.2], abs=0.05)
-    assert slopes(found(EgoPrior(VIEW, seen(-1.2), seen(1.2)), said)) == pytest.approx([-1.2, 1.2], abs=0.05)
+def test_a_line_in_the_lane_is_not_a_boundary_even_if_the_classifier_accepts_it() -> None:
+    probabilities = {-1.2: 0.95, 0.0: 0.95, 1.2: 0.95}
+    assert places(decided(None, probabilities)) == pytest.approx([-1.2, 0.0, 1.2], abs=0.05)
+    assert places(decided(prior_at(-1.2, 1.2), probabilities)) == pytest.approx([-1.2, 1.2], abs=0.05)
 
 
-def test_what_the_classifier_doubts_is_accepted_where_it_was_seen() -> None:
-    said = {-1.2: 0.95, 1.2: 0.3, 3.6: 0.3}
-    assert slopes(found(None, said)) == pytest.approx([-1.2], abs=0.05)
-    detections = found(EgoPrior(VIEW, seen(-1.2), seen(1.2)), said)
-    assert slopes(detections) == pytest.approx([-1.2, 1.2], abs=0.05)
-    assert all(0.5 < d.probability < 1.0 for d in detections)
+def test_an_uncertain_candidate_is_accepted_where_the_prior_saw_a_boundary() -> None:
+    probabilities = {-1.2: 0.95, 1.2: 0.3, 3.6: 0.3}
+    assert places(decided(None, probabilities)) == pytest.approx([-1.2], abs=0.05)
+    detections = decided(prior_at(-1.2, 1.2), probabilities)
+    assert places(detections) == pytest.approx([-1.2, 1.2], abs=0.05)
+    assert all(0.5 < detection.probability < 1.0 for detection in detections)
+
+
+# --- Lane spacing ---------------------------------------------------------------------------------------------------
+
+
+def test_lines_at_whole_lane_widths_have_the_most_weight() -> None:
+    spacing = LaneSpacing(-1.0, 1.4, 0.3)
+    assert spacing.neighbors == pytest.approx((-3.4, 3.8))
+    weight = spacing.weight(np.array([-1.0, 1.4, -3.4, 3.8, 6.2, 0.2]))
+    assert weight[:5] == pytest.approx([1.0, 1.0, 1.0, 1.0, 0.6])
+    assert weight[5] < 0.4
+
+
+def test_beside_a_single_boundary_a_lane_of_the_usual_width_is_assumed() -> None:
+    assert prior_at(-1.2, None).spacing(np.array([-1.2]), 0.3).right == pytest.approx(1.2)
+    assert prior_at(None, 1.2).spacing(np.array([1.2]), 0.3).left == pytest.approx(-1.2)
+    both = prior_at(-1.0, 1.4).spacing(np.array([-1.0, 1.4]), 0.3)
+    assert (both.left, both.right) == (-1.0, 1.4)
+
+
+def test_the_lane_width_is_limited_to_that_of_lanes() -> None:
+    assert 1.0 < LaneSpacing(-0.1, 0.1, 0.3).width < 2.0
+    assert LaneSpacing(-5.0, 5.0, 0.3).width < 5.0
+
+
+# --- The search around a prior --------------------------------------------------------------------------------------
+
+
+def faint_road(curvature: float) -> tuple[Image, EgoPrior, list[Curve]]:
+    """Returns a road of two lanes whose boundaries are hardly visible, a prior of the ego lane, and the boundaries."""
+    curves = [Curve(150.0, (320.0, b, curvature * VIEW.depth**2)) for b in (-1.2, 1.2, 3.6)]
+    image = roads.in_color(roads.draw_road(VIEW, curves, width=0.03, paint=roads.ROAD + 25, noise=4.0))
+    prior = EgoPrior(VIEW, (-1, 1), Curves.of(curves[:2]), np.full((2, 2), 0.05), np.ones(2))
+    return image, prior, curves
+
+
+@pytest.mark.parametrize("curvature", [0.0, 0.02])
+def test_the_boundaries_of_the_prior_and_their_neighbors_come_first(curvature: float) -> None:
+    image, prior, curves = faint_road(curvature)
+    proposals = propose(paint_gray(image), FrameContext(), prior, None, 4)
+    assert len(proposals.curves) == 4
+    assert proposals.view.horizon == pytest.approx(VIEW.horizon, abs=7.0)
+    rows = np.array([200.0, 250.0])
+    for curve in curves:
+        assert np.abs(proposals.curves.x(rows) - curve.x(rows)).max(axis=1).min() < 6.0
+
+
+def test_a_prior_without_boundaries_changes_no_candidates() -> None:
+    gray = paint_gray(faint_road(0.0)[0])
+    plain, with_prior = (propose(gray, FrameContext(), prior, None) for prior in (None, prior_at(None, None)))
+    assert list(plain.curves) == list(with_prior.curves)
+
+
+def test_a_prior_without_boundaries_still_shows_the_horizon() -> None:
+    bare, context = np.full((360, 640), 100, np.uint8), FrameContext(horizon=150.0)
+    nothing = Curves.none(180.0)
+    prior = EgoPrior(RoadView(640, 360, 180.0), (), nothing, np.empty((0, 2)), np.empty(0))
+    assert propose(bare, context, prior, None).view.horizon == pytest.approx(180.0, abs=7.0)
+    assert propose(bare, context, None, None).view.horizon == pytest.approx(150.0, abs=7.0)
+
+
+def test_tracked_boundaries_come_before_those_of_the_prior() -> None:
+    image, prior, _ = faint_road(0.0)
+    tracked = lines(-0.6)
+    proposals = propose(paint_gray(image), FrameContext(150.0, tracked), prior, None)
+    rows = np.linspace(180.0, 359.0, 20)  # the search finds another horizon, near which curves differ
+    np.testing.assert_allclose(proposals.curves[0].x(rows), tracked[0].x(rows), atol=0.1)

@@ -1,0 +1,94 @@
+"""The regressor's training samples: warped road crops with their targets, and the files of road frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lanestream.road.crops import RoadCropGeometry
+from lanestream.road.curve import Curve
+from lanestream.road.view import Image, RoadView
+from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
+from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.samples.road_frames import RoadFrame, read_frames, write_frames
+
+WIDTH, HEIGHT, HORIZON = 640, 360, 150.0
+MIDDLE = (WIDTH - 1) / 2.0
+LEFT, RIGHT = Curve(HORIZON, (MIDDLE + 8.0, -1.1, 300.0)), Curve(HORIZON, (MIDDLE + 8.0, 1.3, 300.0))
+
+
+def points(curve: Curve) -> NDArray[np.float64]:
+    rows = np.linspace(HEIGHT - 1.0, HORIZON + 12.0, 120)
+    columns = curve.x(rows)
+    return np.stack([columns, rows], axis=1)[(columns >= 0) & (columns <= WIDTH - 1)]
+
+
+def road() -> Image:
+    """Returns a gray road with both boundaries in white."""
+    image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    for curve in (LEFT, RIGHT):
+        line = points(curve).round().astype(np.int32)
+        cv2.polylines(image, [line], isClosed=False, color=(255, 255, 255), thickness=3)
+    return image
+
+
+@pytest.fixture(scope="module")
+def frame() -> RoadFrame:
+    lanes = tuple(LabelledLane(points(curve)) for curve in (LEFT, RIGHT))
+    made = RoadFrame.of(LabelledFrame(WIDTH, HEIGHT, lanes, "drive", "drawn", WHOLE), road())
+    assert made is not None
+    return made
+
+
+@pytest.mark.parametrize(
+    "warp",
+    [
+        Warp(),
+        Warp(pan=0.05),
+        Warp(side=0.2),
+        Warp(zoom=1.15),
+        Warp(bend=0.01),
+        Warp(assumed=0.1),
+        Warp(flipped=True),
+        Warp(pan=-0.04, side=-0.15, zoom=0.9, bend=-0.01, assumed=-0.05, flipped=True),
+    ],
+)
+def test_a_warped_frame_has_its_paint_where_the_target_says(frame: RoadFrame, warp: Warp) -> None:
+    geometry = RoadCropGeometry()
+    crop, target = sample(frame, geometry, warp)
+    view = RoadView(frame.width, frame.height, frame.horizon)
+    seen = RoadView(frame.width, frame.height, frame.horizon + warp.assumed * view.depth)
+    grid_columns, grid_rows = geometry.grid(seen)
+    checked = 0
+    for side in (0, 1):
+        for share, x, known in zip(SHARES, target.columns[side], target.known[side], strict=True):
+            row = int(np.argmin(np.abs(grid_rows[:, 0] - (view.horizon + share * view.depth))))
+            column = (frame.width - 1) / 2.0 + x * frame.width
+            if known < 1.0 or share < 0.2 or not grid_columns[row, 8] < column < grid_columns[row, -9]:
+                continue
+            at = int(np.argmin(np.abs(grid_columns[row] - column)))
+            bright = (crop[row, at - 8 : at + 9, 0].astype(float) - 90.0).clip(0)
+            assert bright.max() > 60.0
+            assert abs(float((bright * np.arange(-8, 9)).sum() / bright.sum())) < 2.5
+            checked += 1
+    assert checked >= 6
+    assert target.presence.tolist() == [1.0, 1.0]
+    assert target.horizon == pytest.approx((view.horizon - seen.horizon) / seen.depth)
+
+
+def test_a_plain_warp_takes_the_nearest_look_if_the_horizon_is_unknown(frame: RoadFrame) -> None:
+    assert plain_warp(frame, known=True) == Warp()
+    depth = frame.height - 1.0 - frame.horizon
+    assert frame.horizon + plain_warp(frame, known=False).assumed * depth == pytest.approx(0.39 * frame.height)
+
+
+def test_frames_are_read_from_their_file_as_they_were_written(frame: RoadFrame, tmp_path: Path) -> None:
+    path = tmp_path / "frames.npz"
+    assert write_frames(path, [frame, frame]) == 2
+    read = read_frames(path)[1]
+    np.testing.assert_allclose(read.lanes[0], frame.lanes[0], atol=1e-3)
+    assert (read.jpeg, read.horizon, read.group) == (frame.jpeg, frame.horizon, "drive")
