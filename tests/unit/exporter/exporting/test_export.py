@@ -113,7 +113,7 @@ def test_the_regressors_file_says_what_its_answer_is(regressor: Exported) -> Non
     inputs = regressor.check.inputs
     with torch.inference_mode():
         answer = RegressorPrediction.of(subject.network(normalize(torch.from_numpy(inputs))))
-    told = replace(answer, presence=answer.presence / subject.calibration.temperature).told().numpy()
+    told = replace(answer, presence=answer.presence / subject.calibration.temperature).served().numpy()
     np.testing.assert_allclose(OnnxModel.load(regressor.path, "cpu").run(inputs), told, atol=1e-4)
     assert regressor.report.written is regressor.report.fp32
     assert regressor.report.time_ratio is None
