@@ -5,15 +5,18 @@
 import argparse
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
 import litserve
+import numpy as np
+from lanestream.runtime import Provider
 
+from lanestream.detection import Question, Steps, in_one
+from lanestream.detection.features import WORKING_WIDTH
 from lanestream.engine import load_engine
-from lanestream.images.decoding import ImageLimits
+from lanestream.images.decoding import DecodedImage, ImageLimits, decode_reduced
 from lanestream.messages import ProcessedFrame, lanes_message
-from lanestream.workers.frame_worker import EncodedFrame, FrameWorker
+from lanestream.road.results import FrameResult
 
 # LitServe's documentation uses batches of 8 that wait 50 to 100 ms. A shorter wait is better with few clients.
 MAX_BATCH_SIZE: Final = 8
@@ -23,31 +26,56 @@ BATCH_TIMEOUT_S: Final = 0.01
 class LitServeLaneApi(litserve.LitAPI):  # type: ignore[misc]
     """Images in, lanes out. There are no cameras: every image is processed on its own."""
 
-    def __init__(self, provider: str) -> None:
+    def __init__(self, provider: Provider) -> None:
         super().__init__(max_batch_size=MAX_BATCH_SIZE, batch_timeout=BATCH_TIMEOUT_S)
         self._provider = provider
 
     def setup(self, device: str) -> None:  # noqa: ARG002 - LitServe's signature
         """Loads and warms up the networks, in the worker process."""
         self._engine = load_engine(provider=self._provider)
-        self._worker = FrameWorker(self._engine.models, ImageLimits())
-        self._threads = ThreadPoolExecutor(MAX_BATCH_SIZE)
 
-    def decode_request(self, request: litserve.Request) -> bytes:
-        """Reads the image file in the form field `image`."""
-        data: bytes = request["image"].file.read()
-        return data
+    def decode_request(self, request: litserve.Request) -> DecodedImage:
+        """Decodes the image in the form field `image`."""
+        return decode_reduced(request["image"].file.read(), ImageLimits(), WORKING_WIDTH)
 
-    def predict(self, images: Sequence[bytes]) -> list[ProcessedFrame]:
-        """Finds the lanes in a batch of images. What they need from the networks is run together."""
-        return list(self._threads.map(self._find_lanes, images))
+    def predict(self, images: Sequence[DecodedImage]) -> list[ProcessedFrame]:
+        """Finds the lanes in a batch of images."""
+        frames = [self._engine.open_session().follow(image.image, 0.0) for image in images]
+        return [
+            ProcessedFrame.of(image, result, _NO_TIMING)
+            for image, result in zip(images, run_batched(frames), strict=True)
+        ]
 
     def encode_response(self, output: ProcessedFrame) -> dict[str, Any]:
         """Returns the message that our service sends, too."""
         return lanes_message(output, seq=0, timestamp=time.monotonic()).model_dump(mode="json")
 
-    def _find_lanes(self, image: bytes) -> ProcessedFrame:
-        return self._worker.process(self._engine.open_session(), EncodedFrame(image, 0.0, time.monotonic()))
+
+_NO_TIMING: Final = dict.fromkeys(("decode", "propose", "queue", "infer", "track", "total"), 0.0)
+
+
+def run_batched(frames: Sequence[Steps[FrameResult]]) -> list[FrameResult]:
+    """Returns the results of all frames. Their inputs for the same network are run as one batch."""
+    whole = [in_one(steps) for steps in frames]
+    results: dict[int, FrameResult] = {}
+    pending: dict[int, Question] = {}
+
+    def go(index: int, answer: Any) -> None:
+        try:
+            pending[index] = whole[index].send(answer)
+        except StopIteration as end:
+            results[index] = end.value
+
+    for index in range(len(frames)):
+        go(index, None)
+    while pending:
+        network = next(iter(pending.values())).network
+        together = {i: pending.pop(i) for i in list(pending) if pending[i].network is network}
+        outputs = network.run(np.concatenate([question.inputs for question in together.values()]))
+        ends = np.cumsum([len(question.inputs) for question in together.values()])
+        for index, answer in zip(together, np.split(outputs, ends[:-1]), strict=True):
+            go(index, answer)
+    return [results[index] for index in range(len(frames))]
 
 
 if __name__ == "__main__":
