@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from lanestream.inference import OnnxModel
+from lanestream.inference.onnx_model import load
 
 TOOL = Path(__file__).parents[2] / "tools" / "train_toy.py"
 
@@ -40,7 +40,7 @@ def test_it_learns(toy: Path) -> None:
 
 
 def test_the_model_records_what_it_was_trained_on(toy: Path) -> None:
-    info = OnnxModel.load(toy / "toy.onnx", "cpu").info
+    info = load(toy / "toy.onnx").info
     assert info.training["config"]["steps"] == curve(toy)[-1]["step"]
     assert info.training["data"]["real_frames"] == [{"name": "toy roads"}]
     assert info.training["data"]["real"]["train"] > 100

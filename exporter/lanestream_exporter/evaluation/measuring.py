@@ -35,6 +35,12 @@ class EvaluationSet:
     images: Callable[[], LabelledImages]
     clips: tuple[LabelledClip, ...] = ()
 
+    def __post_init__(self) -> None:
+        names = [clip.name for clip in self.clips]
+        repeated = next((name for name in names if names.count(name) > 1), None)
+        if repeated is not None:  # figures are kept by name
+            raise LabelError(f"two clips are named {repeated!r}", "rename one of the videos and its labels")
+
     @classmethod
     def of_split(cls, datasets: DatasetCollection, split: Split) -> EvaluationSet:
         """Returns a split of the data sets of a manifest. Raises LabelError for a bad record."""

@@ -12,8 +12,9 @@ import cv2
 
 SCENES_PER_FILE = 250
 
-# The version of rendering and labeling. It is part of the file names, so that files of another version are not used.
-RENDERING_VERSION = 3
+# The version of rendering, of candidates and of labeling. It is part of the file names, so that files of another
+# version are not used.
+SAMPLES_VERSION = 4
 
 # Called with a file's number, its number of scenes and its path; writes the file.
 WriteScenes = Callable[[int, int, Path], object]
@@ -28,13 +29,13 @@ def scenes_per_file(scenes: int) -> list[int]:
 def scene_files(
     folder: Path, kind: str, scenes: Sequence[int], write: WriteScenes, workers: int, done: Callable[[int], None]
 ) -> list[Path]:
-    """Returns files named by `kind` and rendering version, the n-th with `scenes[n]` scenes; writes missing ones.
+    """Returns files named by `kind` and the samples' version, the n-th with `scenes[n]` scenes; writes missing ones.
 
     `write` must be a module-level function, because other processes call it. `done` is called with the number of scenes
     of each file when it is finished.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{kind}-{RENDERING_VERSION}-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
+    paths = [folder / f"{kind}-{SAMPLES_VERSION}-{number:04d}-{count}.npz" for number, count in enumerate(scenes)]
     missing = [number for number, path in enumerate(paths) if not path.exists()]
     done(sum(scenes) - sum(scenes[number] for number in missing))
     # Spawned, because a forked OpenCV or torch may wait for threads that do not exist after a fork.

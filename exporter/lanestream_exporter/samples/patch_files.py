@@ -18,7 +18,7 @@ from lanestream.errors import LabelError
 from lanestream.road.crops import PatchGeometry
 from lanestream.road.view import RoadView, Scaling
 from lanestream_exporter.datasets.labels import LabelledImages, to_working
-from lanestream_exporter.samples.cache import scene_files
+from lanestream_exporter.samples.cache import SAMPLES_VERSION, scene_files
 from lanestream_exporter.samples.patches import PatchMaker
 from lanestream_exporter.samples.prior_regressor import PriorRegressor, load_prior_regressor
 from lanestream_exporter.scenes import render_still, sample_scene
@@ -113,7 +113,7 @@ class PatchCache:
         Patches are cut from the proposed candidates; for training also from jittered labels, several times. Raises
         ModelError for a bad regressor.
         """
-        path = self.folder / f"{name}-{self._kind}.npz"
+        path = self.folder / f"{name}-{self._kind}-{SAMPLES_VERSION}.npz"
         if not path.exists():
             self.folder.mkdir(parents=True, exist_ok=True)
             limit = _MOST_TO_TRAIN if to_train else MOST_CANDIDATES

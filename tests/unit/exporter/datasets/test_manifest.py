@@ -15,6 +15,7 @@ from lanestream_exporter.datasets import images
 from lanestream_exporter.datasets.labels import Coverage
 from lanestream_exporter.datasets.manifest import SHIPPED_MANIFEST, DatasetCollection, origin_of
 from lanestream_exporter.datasets.splits import SPLITS
+from lanestream_exporter.evaluation.measuring import EvaluationSet
 
 BY_GROUP = {"by": "group", "val": 0.3}
 
@@ -103,6 +104,14 @@ def test_a_video_is_cut_by_frame_numbers(tmp_path: Path, clip: Path) -> None:
     assert whole.frames.stop > 100_000
     with pytest.raises(LabelError, match="the manifest puts no frames into the split 'val'"):
         datasets.require_splits("train", "val")
+
+
+def test_two_clips_of_one_name_cannot_be_evaluated(tmp_path: Path, clip: Path) -> None:
+    for folder in ("a", "b"):
+        shutil.copytree(clip, tmp_path / folder)
+    datasets = opened(tmp_path, *({"name": folder, "path": folder, "split": "test"} for folder in ("a", "b")))
+    with pytest.raises(LabelError, match="two clips are named 'drive'"):
+        EvaluationSet.of_split(datasets, "test")
 
 
 def test_stills_cannot_be_cut_by_frame_numbers(tmp_path: Path, draw: Draw) -> None:

@@ -102,14 +102,14 @@ def test_without_real_shares_no_data_set_is_opened(tmp_path: Path) -> None:
 
 def test_rendered_scenes_are_spread_over_files_and_the_first_validates(tmp_path: Path) -> None:
     data = TrainingData(rendered_scenes=3, validation_scenes=2, real_share=0.0, final_real_share=0.0)
-    (tmp_path / "rendered-64-1-0000-2.npz").write_bytes(b"scenes of an older rendering version")
+    (tmp_path / "rendered-64-1-0000-2.npz").write_bytes(b"samples of an older version")
     calls: list[tuple[int, int]] = []
     cache = PatchCache(tmp_path, 64)
     (files,) = patch_files(data, None, cache, lambda more, total: calls.append((more, total)))
     assert sum(more for more, _ in calls) == calls[-1][1] == 5
     assert [path.name for path in (*files.check, *files.train)] == [
-        "rendered-64-3-0000-2.npz",
-        "rendered-64-3-0001-3.npz",
+        "rendered-64-4-0000-2.npz",
+        "rendered-64-4-0001-3.npz",
     ]
     source = files.read()
     assert source.counts["train"] == len(source.train) > len(source.check) > 0
