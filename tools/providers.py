@@ -14,15 +14,17 @@ from typing import Final
 
 import click
 import numpy as np
-from lanestream.runtime import PROVIDERS, RuntimeOptions
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from lanestream.detection.interface import ModelRole
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
 from lanestream.errors import ProviderError
-from lanestream.inference import LoadedModel, load_model
+from lanestream.inference.loaded_model import LoadedModel
+from lanestream.inference.loading import load_model
+from lanestream.inference.providers import PROVIDERS, RuntimeOptions
 from lanestream_exporter.scenes import render_still, sample_scene
 
 _FILES: Final = (SHIPPED_MODEL, SHIPPED_MODEL.with_name("classifier-fp32.onnx"), SHIPPED_REGRESSOR)
@@ -62,22 +64,26 @@ def main(threads: int | None, rounds: int, json_file: Path | None) -> None:
 
 def _inputs() -> Sequence[Inputs]:
     """Returns the inputs of the classifier and of the regressor for rendered roads."""
-    rng = np.random.default_rng(5)
-    stills = [render_still(sample_scene(rng, 640, 360)).image for _ in range(_SCENES)]
-    return [
-        np.concatenate([pipeline.detector.prepare(still).inputs for still in stills])
-        for pipeline in load_engine(provider="cpu").pipelines
-    ]
+    engine, rng = load_engine(provider="cpu"), np.random.default_rng(5)
+    inputs: dict[ModelRole, list[Inputs]] = {"classifier": [], "regressor": []}
+
+    def infer(role: ModelRole, batch: Inputs) -> NDArray[np.float32]:
+        inputs[role].append(batch)
+        return engine.models[role].run(batch)
+
+    for _ in range(_SCENES):
+        engine.open_session().process(render_still(sample_scene(rng, 640, 360)).image, 0.0, infer)
+    return [np.concatenate(batches) for batches in inputs.values()]
 
 
 def _networks(path: Path, options: RuntimeOptions) -> Mapping[str, LoadedModel]:
     networks = {}
-    for provider in PROVIDERS[1:]:
+    for provider in PROVIDERS:
         try:
-            networks[provider] = load_model(path, provider, options)
+            networks[provider.name] = load_model(path, provider.name, options)
         except ProviderError:
             continue
-        networks[provider].warm_up()
+        networks[provider.name].warm_up()
     return networks
 
 

@@ -16,11 +16,11 @@ from typing import Any, Final
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from lanestream.tracking import TrackerSettings
-
 SUBPROTOCOL: Final = "lanestream.v1"
 FRAME_S: Final = 0.04
 _ANSWER_TIMEOUT_S: Final = 30.0
+# A track ends after this gap between frames, see `_COAST_S` of lanestream.tracking.tracker.
+_COAST_S: Final = 0.7
 # From this frame on, track ids must not change.
 _STABLE_FROM_SEQ: Final = 10
 _NOT_IMAGES: Final = (b"", b"not an image", b"\xff\xd8\xff\xe0 cut", bytes(100_000))
@@ -187,7 +187,7 @@ class SoakCamera:
         After a gap longer than the tracker predicts boundaries without seeing them, ids may be new.
         """
         gap_s, self.last_timestamp = answer["timestamp"] - self.last_timestamp, answer["timestamp"]
-        if gap_s > TrackerSettings.coast_s:
+        if gap_s > _COAST_S:
             self.ids = {}
         ids = {lane["position"]: lane["track_id"] for lane in answer["lanes"] if lane["position"] in (-1, 1)}
         same = all(ids[position] == self.ids.get(position, ids[position]) for position in ids)

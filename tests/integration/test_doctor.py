@@ -36,7 +36,7 @@ def test_the_shipped_networks_are_loaded_and_timed() -> None:
         assert (network["provider"], network["precision"], network["threads"]) == ("cpu", "int8", 1)
         assert set(network["nodes"]) == {"CPU"}
         assert not network["fell_back"]
-        assert list(network["run_ms"]) == ["1", "2", "4", "8", "12", "16"]
+        assert list(network["run_ms"]) == ["1", "2", "4", "8"]
         assert all(milliseconds > 0.0 for milliseconds in network["run_ms"].values())
 
 
@@ -56,7 +56,7 @@ def test_the_tables_have_unbroken_lines_in_a_pipe() -> None:
         (("--require", "tensorrt"), "the installed onnxruntime has no TensorRT"),
         (
             ("--require", "cuda", "--provider", "cpu", "--regressor", "none"),
-            "runs on cpu, not on cuda: cpu was asked for",
+            "runs on cpu, not on cuda: cpu was requested",
         ),
         (("--model", "none.onnx"), "no model file at none.onnx"),
         (("--regressor", "none.onnx", "--provider", "cpu"), "no model file at none.onnx"),

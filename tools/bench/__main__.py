@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import click
-from lanestream.runtime import PROVIDERS, Provider
 
 from bench.frames import load_clips
 from bench.measure import benchmark, run_suite
@@ -16,6 +15,7 @@ from bench.report import markdown, report
 from bench.runners import litserve_installed
 from bench.workload import QUICK, Suite
 from lanestream.errors import LanestreamError
+from lanestream.inference.providers import AUTO, PROVIDER_NAMES
 
 
 @click.command()
@@ -24,7 +24,7 @@ from lanestream.errors import LanestreamError
 @click.option("--soak-minutes", type=click.FloatRange(0.01), help="Minutes of overload at the end  [default: 0.5]")
 @click.option("--clip", help="A video or a folder of images  [default: a rendered drive]")
 @click.option("--frames", type=click.IntRange(1), default=24, show_default=True, help="Frames of it to send.")
-@click.option("--provider", type=click.Choice(PROVIDERS), default="auto", show_default=True)
+@click.option("--provider", type=click.Choice(PROVIDER_NAMES), default=AUTO, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out"), show_default=True)
 def main(
     quick: bool,
@@ -32,7 +32,7 @@ def main(
     soak_minutes: float | None,
     clip: str | None,
     frames: int,
-    provider: Provider,
+    provider: str,
     out: Path,
 ) -> None:
     """Compare the service with the in-process pipeline, a baseline service and LitServe, on the same frames."""
@@ -44,7 +44,7 @@ def main(
         raise click.ClickException(str(error)) from error
 
 
-def measure(suite: Suite, provider: Provider, clip: str | None, frames: int, out: Path) -> None:
+def measure(suite: Suite, provider: str, clip: str | None, frames: int, out: Path) -> None:
     """Measures `suite`, writes the report and its figure into the folder `out` and prints the tables."""
     if not litserve_installed():
         click.echo("LitServe is not installed and is left out (to compare with it: pip install -e '.[bench-litserve]')")

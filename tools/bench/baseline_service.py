@@ -20,9 +20,9 @@ from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from lanestream.detection.features import WORKING_WIDTH, find_edges
-from lanestream.detection.hough import ExtendedHough
-from lanestream.road.view import Image
+from lanestream.detection.features import find_edges
+from lanestream.detection.hough import hough_lines
+from lanestream.road.view import WORKING_WIDTH, Image
 from lanestream_exporter.alexnet import FULL, AlexNet
 
 HORIZON = 0.45  # of the image height; fixed, as for one camera
@@ -65,9 +65,9 @@ def candidate_lines(image: Image, limit: int) -> list[Line]:
     scale = WORKING_WIDTH / image.shape[1]
     gray = np.asarray(cv2.cvtColor(cv2.resize(image, None, fx=scale, fy=scale), cv2.COLOR_BGR2GRAY), np.uint8)
     top, bottom = int(HORIZON * gray.shape[0]), gray.shape[0] - 1
-    lines = ExtendedHough(limit=limit).lines(find_edges(gray, top), gray.shape[1], bottom)
+    lines = hough_lines(find_edges(gray, top), gray.shape[1], bottom)
     tops = lines.x_bottom + lines.slope * (top - bottom)
-    return [(float(x) / scale, float(t) / scale) for x, t in zip(lines.x_bottom, tops, strict=True)]
+    return [(float(x) / scale, float(t) / scale) for x, t in zip(lines.x_bottom, tops, strict=True)][:limit]
 
 
 def masked_patch(image: Image, line: Line) -> Image:

@@ -14,11 +14,12 @@ from itertools import count
 from multiprocessing.connection import Connection
 
 import cv2
-from lanestream.runtime import Provider
+import numpy as np
+from numpy.typing import NDArray
 
 from bench.frames import FPS, Clips, forward_and_backward
 from bench.workload import PIPELINE, POOL, LoadRequest, LoadResult, Reply
-from lanestream.detection import in_one
+from lanestream.detection.interface import ModelRole
 from lanestream.engine import Engine, load_engine
 from lanestream.images.decoding import ImageLimits, decode
 from lanestream.local import LocalCamera, LocalEngine
@@ -26,9 +27,9 @@ from lanestream.logs import log_config
 from lanestream.settings import load_settings
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame
-from lanestream.workers.ipc import Setup
+from lanestream.workers.ipc import WorkerSetup
 from lanestream.workers.pool import WorkerPool
-from lanestream.workers.process_pool import ProcessPool, usual_processes
+from lanestream.workers.process_pool import ProcessPool, default_processes
 from lanestream.workers.thread_pool import ThreadPool
 
 
@@ -43,24 +44,25 @@ class PipelineInfo:
     patches: float
 
 
-def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
+def run_pipeline(pipe: Connection, clips: Clips, provider: str) -> None:
     """Serves load requests from `pipe` until it is closed; the target of a process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     settings = load_settings()
     cv2.setNumThreads(settings.opencv_threads)
     load = partial(load_engine, provider=provider, options=settings.runtime_options)
     engine = load()
-    processes = settings.processes or usual_processes(Capabilities.of(engine.pipelines))
+    processes = settings.processes or default_processes(Capabilities.of(engine))
     threads = processes * settings.threads_per_process(processes)
-    network = engine.network
+    model = engine.main_model()
     patches = patches_per_frame(engine, clips[max(clips)])
     with ThreadPoolExecutor(1) as worker, asyncio.Runner() as loop:
-        setup = Setup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
+        setup = WorkerSetup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
         pools: dict[str, WorkerPool] = {
             PIPELINE: ThreadPool(engine, settings.image_limits, threads),
-            POOL: worker.submit(loop.run, ProcessPool.started(setup, processes, settings.threads_per_process)).result(),
+            POOL: worker.submit(loop.run, ProcessPool.start(setup, processes, settings.threads_per_process)).result(),
         }
-        pipe.send(PipelineInfo(processes, threads // processes, network.name, network.provider, patches))
+        provider = model.placement.provider
+        pipe.send(PipelineInfo(processes, threads // processes, model.name, provider, patches))
         while True:
             request: LoadRequest = pipe.recv()
             cameras = InProcessCameras(engine, request, clips[request.size], threads)
@@ -79,17 +81,16 @@ def run_pipeline(pipe: Connection, clips: Clips, provider: Provider) -> None:
 
 def patches_per_frame(engine: Engine, jpegs: Sequence[bytes]) -> float:
     """Returns how many patches per frame the default detector classifies, on average over a drive."""
-    session = engine.open_session()
+    session, main_role = engine.open_session(), engine.main_roles[engine.select()]
     patches = 0
+
+    def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        nonlocal patches
+        patches += len(inputs) if role == main_role else 0
+        return engine.models[role].run(inputs)
+
     for number, jpeg in enumerate(jpegs):
-        steps = in_one(session.follow(decode(jpeg, ImageLimits()), number / FPS))
-        try:
-            question = next(steps)
-            while True:
-                patches += len(question.inputs) if question.network is engine.network else 0
-                question = steps.send(question.network.run(question.inputs))
-        except StopIteration:
-            pass
+        session.process(decode(jpeg, ImageLimits()), number / FPS, infer)
     return patches / len(jpegs)
 
 
@@ -131,11 +132,11 @@ class InProcessCameras:
         await asyncio.gather(*done)
 
     async def _stream(self, pool: WorkerPool, number: int) -> None:
-        camera, seq = pool.open_camera(detector=self.request.detector), 0
+        session, seq = pool.open_session(detector=self.request.detector), 0
         while True:
             started = time.monotonic()
-            async with pool.turn():
-                await pool.run(camera, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
+            async with pool.admit():
+                await pool.run(session, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
             self._add_reply(number, started)
             seq += 1
 

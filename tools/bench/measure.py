@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from lanestream.runtime import Provider
-
 from bench.frames import Clips
 from bench.in_process import PipelineInfo, run_pipeline
 from bench.load_generator import generate
@@ -194,7 +192,7 @@ def _describe(workload: Workload, sample: Sample) -> str:
 
 
 @contextmanager
-def benchmark(clips: Clips, provider: Provider, folder: Path) -> Iterator[Benchmark]:
+def benchmark(clips: Clips, provider: str, folder: Path) -> Iterator[Benchmark]:
     """Starts and warms up all runners and ends them afterwards. Their logs go to `folder`."""
     with ExitStack() as stack:
         pipeline = _helper(stack, run_pipeline, clips, provider)

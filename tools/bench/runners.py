@@ -18,10 +18,9 @@ from typing import Any, Final
 import httpx
 import psutil
 from demo import LANESTREAM, free_port, stop
-from lanestream.runtime import Provider
 
 from bench.workload import BASELINE, LITSERVE, SERVICE, LoadRequest, LoadResult, Transport
-from lanestream.detection.proposals import CandidateSearch
+from lanestream.detection.proposals import MOST_WITH_TRACKS
 
 READY_S: Final = 120.0
 # More than any suite needs, so that the service's own limits are not measured. Streams break off after each workload
@@ -85,14 +84,14 @@ class ServerProgram:
     path: str
 
 
-def server_programs(provider: Provider) -> list[ServerProgram]:
+def server_programs(provider: str) -> list[ServerProgram]:
     """Returns the servers that can run here: LitServe only if it is installed.
 
     The baseline classifies as many candidates per frame as our service does at most in a stream.
     """
     python = (sys.executable, "-m")
     service = (LANESTREAM, "serve", "--provider", provider)
-    baseline = (*python, "bench.baseline_service", "--candidates", str(CandidateSearch.followed))
+    baseline = (*python, "bench.baseline_service", "--candidates", str(MOST_WITH_TRACKS))
     litserve = (*python, "bench.litserve_service", "--provider", provider)
     programs = [
         ServerProgram(SERVICE, "lanestream", service, "/readyz", "ws", "/v1/stream"),
