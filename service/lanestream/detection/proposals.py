@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection.ego_prior import EgoPrior
 from lanestream.detection.features import find_edges
-from lanestream.detection.hough import hough_lines
+from lanestream.detection.hough import HoughLines, hough_curves, hough_lines
 from lanestream.detection.interface import FrameContext
 from lanestream.detection.marking_filter import Ridges, find_ridges
 from lanestream.detection.vanishing_point import (
@@ -21,7 +21,7 @@ from lanestream.detection.vanishing_point import (
     refine,
     vote_of_lines,
 )
-from lanestream.road.curve import Curves, VanishingPoint
+from lanestream.road.curve import Curves, FloatArray, VanishingPoint
 from lanestream.road.view import Image, RoadView, Spans, visible_spans
 
 # The most candidates of a frame, and of one in which boundaries are tracked: those come first, so fewer are needed.
@@ -70,10 +70,11 @@ def propose(
     boundaries after a fit to their paint (`on_paint`), and the lines found in the image, strongest first.
     """
     height, width = gray.shape
-    point, ridges = _find_vanishing_point(gray, context, prior)
+    road = _search_road(gray, context, prior)
+    point = road.point
     view = RoadView(width, height, point.y)
-    lines = find_lines(ridges, point, width)
-    strength = lines.strength / max(float(lines.strength.max(initial=0.0)), 1e-9)
+    lines = find_lines(road.ridges, point, width)
+    found, strength = point.curves(lines.places), _normalized(lines.strength)
     tracked = (context.tracked or Curves.none(point.y)).below(point.y, view.bottom)
     leading = [tracked]
     if prior is not None and prior.sides:
@@ -82,8 +83,12 @@ def propose(
         spacing = prior.spacing(point.places(own.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
         strength = strength * spacing.weight(lines.places)
         leading += [own, point.curves(spacing.neighbors)]
+    if road.hough is not None:
+        curves, votes = hough_curves(road.hough, point, view)
+        found = Curves.concatenate([found, curves])
+        strength = np.concatenate([strength, _normalized(votes)])
     order = np.argsort(-strength, kind="stable")
-    found = point.curves(lines.places[order[strength[order] >= _LEAST_STRENGTH]])
+    found = found.take(order[strength[order] >= _LEAST_STRENGTH])
     ranked = Curves.concatenate([*leading, found])
     chosen = non_maximum_suppression(are_duplicates(ranked, ranked, view))
     first = chosen < sum(len(curves) for curves in leading)
@@ -96,13 +101,21 @@ def propose(
     return Proposals(curves.take(kept), spans.take(kept), view, point.weight, prior)
 
 
-def _find_vanishing_point(gray: Image, context: FrameContext, prior: EgoPrior | None) -> tuple[VanishingPoint, Ridges]:
-    """Returns the vanishing point, near that of the prior or else found from edges, and the ridges of the road."""
+@dataclass(frozen=True)
+class _Road:
+    """The vanishing point of a frame, its ridges, and its Hough lines if no prior led to the vanishing point."""
+
+    point: VanishingPoint
+    ridges: Ridges
+    hough: HoughLines | None = None
+
+
+def _search_road(gray: Image, context: FrameContext, prior: EgoPrior | None) -> _Road:
+    """Returns the vanishing point, near that of the prior, or else where the lines of the edges meet."""
     height, width = gray.shape
     if prior is not None and prior.sides:
-        guess = prior.vanishing_point
-        ridges = find_ridges(gray, guess)
-        return refine(guess, ridges, width, height - 1.0, NEAR_PRIOR), ridges
+        ridges = find_ridges(gray, prior.vanishing_point)
+        return _Road(refine(prior.vanishing_point, ridges, width, height - 1.0, NEAR_PRIOR), ridges)
     horizon = context.horizon
     if horizon is not None:
         # A prior that sees no boundary in the dark, or in a sharp bend, still sees where the road ends.
@@ -112,7 +125,12 @@ def _find_vanishing_point(gray: Image, context: FrameContext, prior: EgoPrior | 
     guess = vote_of_lines(lines, width, height, horizon)
     ridges = find_ridges(gray, guess)
     point = refine(guess, ridges, width, height - 1.0, WIDE if horizon is None else KNOWN_HORIZON)
-    return VanishingPoint(point.x, min(point.y, _LOWEST_HORIZON * height), point.k, point.weight), ridges
+    return _Road(replace(point, y=min(point.y, _LOWEST_HORIZON * height)), ridges, lines)
+
+
+def _normalized(strength: FloatArray) -> FloatArray:
+    """Returns strengths relative to the strongest."""
+    return strength / max(float(strength.max(initial=0.0)), 1e-9)
 
 
 def are_duplicates(

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lanestream.processors import processors
 from pydantic_core import PydanticUndefined
 
 from lanestream.errors import SettingsError
+from lanestream.host import processors
 from lanestream.keys import ApiKey
 from lanestream.settings import Settings, load_settings, to_toml
 
