@@ -128,11 +128,11 @@ def expressions() -> Iterator[str]:
 def exposition() -> str:
     """Returns the metrics of a service in which everything has happened once."""
     metrics = Metrics()
-    for offer in Capabilities.of(fakes.engine().pipelines).all:
-        metrics.loaded(offer)
+    for info in Capabilities.of(fakes.engine()).detectors:
+        metrics.loaded(info)
     metrics.workers(tuple)
     metrics.frame_processed({"decode": 1.0}, 0.1)
-    metrics.batch(BatchReport("fake 1", rows=1, questions=1, still_waiting=0, oldest_s=0.0))
+    metrics.batch(BatchReport("fake 1", inputs=1, requests=1, still_waiting=0, longest_wait_s=0.0))
     metrics.socket_closed(1000)
     metrics.refused("bad_image")
     return metrics.exposition().decode()
