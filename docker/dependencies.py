@@ -1,6 +1,6 @@
 """Fills the image's environment: `dependencies.py ENVIRONMENT EXTRA...`, next to the product's pyproject.toml.
 
-Installs the requirements of the product and its extras, and removes what the service never imports.
+Installs the requirements of the product and its extras, and removes files that the service never uses.
 """
 
 import shutil
@@ -9,11 +9,6 @@ import sys
 import tomllib
 from pathlib import Path
 
-# filterpy requires matplotlib, for plots that the service does not use; only matplotlib requires the others.
-UNUSED_PACKAGES = (
-    *("matplotlib", "contourpy", "cycler", "fonttools"),
-    *("kiwisolver", "pillow", "pyparsing", "python-dateutil"),
-)
 # Packages contain their tests, and OpenVINO has plugins for Intel's GPUs and NPUs, which a container has no access to.
 UNUSED_FILES = ("**/tests", "openvino/libs/libopenvino_intel_[gn]pu_plugin.so")
 
@@ -37,7 +32,6 @@ def main(environment: Path, extras: list[str]) -> None:
     """Installs the requirements and removes what is not used."""
     pip = [sys.executable, "-m", "pip", "--python", environment / "bin/python"]
     subprocess.run([*pip, "install", *requirements(Path("pyproject.toml"), extras)], check=True)
-    subprocess.run([*pip, "uninstall", "--yes", *UNUSED_PACKAGES], check=True)
     for packages in environment.glob("lib/python*/site-packages"):
         prune(packages)
 

@@ -72,6 +72,15 @@ class LaneService(Protocol):
         ...
 
 
+class InProcessPlacement(Protocol):
+    """Where a network runs."""
+
+    @property
+    def provider(self) -> str:
+        """The execution provider that runs it."""
+        ...
+
+
 class InProcessNetwork(Protocol):
     """A network of the engine."""
 
@@ -81,8 +90,8 @@ class InProcessNetwork(Protocol):
         ...
 
     @property
-    def provider(self) -> str:
-        """The execution provider that runs it."""
+    def placement(self) -> InProcessPlacement:
+        """Where it runs."""
         ...
 
 
@@ -120,7 +129,7 @@ class InProcessClient:
         Raises NoDetectorError if the detector is not loaded.
         """
         network = self._engine.network(detector)
-        return ServiceInfo(network.name, network.provider)
+        return ServiceInfo(network.name, network.placement.provider)
 
     def detect(
         self,

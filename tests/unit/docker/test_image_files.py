@@ -75,6 +75,7 @@ def test_the_image_needs_one_runtime_and_no_torch(runtime: str) -> None:
     names = [re.split(r"[\[<>=!~; ]", line)[0].lower() for line in needed]
     assert len([name for name in names if name.startswith("onnxruntime")]) == 1
     assert not {"torch", "torchvision", "lanestream"} & set(names)
+    assert not {"filterpy", "scipy", "matplotlib"} & set(names), "the service needs none of them"
     assert {"fastapi", "uvicorn", "pydantic"} <= set(names)
 
 
