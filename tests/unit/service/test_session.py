@@ -1,4 +1,4 @@
-"""One camera's session: what it tells the detector, its horizon, its timing, and that its state restores it exactly."""
+"""One camera's session: the context of each frame, its horizon, its timing, and exact restoring from its state."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def expire(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 @dataclass
 class ScriptedDetector(fakes.FakeDetector):
-    """Finds the fake boundaries below the horizons of a script, and records what it is told of each frame."""
+    """Finds the fake boundaries below the horizons of a script, and records the context of each frame."""
 
     horizons: list[tuple[float, float]]  # of each frame: the row as a share of the height, and its weight
     prior_horizon: float | None = None
@@ -52,7 +52,7 @@ def test_a_detector_gets_a_working_image_of_640_columns() -> None:
     assert detector.sizes == [(360, 640), (360, 640), (400, 640)]
 
 
-def test_a_detector_is_told_what_the_last_frame_showed() -> None:
+def test_the_context_of_a_frame_comes_from_the_frames_before_it() -> None:
     detector = ScriptedDetector([(0.4, 1.0)] * 2, prior_horizon=150.0)
     session = Session(detector)
     for timestamp in (0.0, 0.04):

@@ -231,10 +231,10 @@ def test_the_more_probable_of_two_crossing_lines_is_reported() -> None:
     assert [each.probability for each in boundaries] == pytest.approx([0.8, 0.9])
 
 
-def test_candidates_of_one_marking_become_one_boundary_at_their_mean() -> None:
-    curves = Curves(150.0, np.array([[320.0, place, 0.0] for place in (-1.21, -1.17, -1.19, 1.2)]))
+def test_candidates_of_one_marking_become_one_boundary_at_their_mean_weighted_by_probability() -> None:
+    curves = Curves(150.0, np.array([[320.0, place, 0.0] for place in (-1.21, -1.17, -1.1, 1.2)]))
     proposals = Proposals(curves, visible_spans(curves, VIEW), VIEW, 0.7, None)
-    outputs = np.array([[0.1, 0.9], [0.1, 0.9], [0.6, 0.4], [0.05, 0.95]], np.float32)
+    outputs = np.array([[0.1, 0.9], [0.1, 0.9], [0.48, 0.52], [0.05, 0.95]], np.float32)
     detections = DETECTOR.decide(np.full((360, 640), 90, np.uint8), proposals, outputs)
     assert detections.horizon_weight == 0.7
     assert [each.curve.coefficients[1] for each in detections.boundaries] == pytest.approx([-1.19, 1.2], abs=0.01)

@@ -1,4 +1,4 @@
-"""Patches: the boundary is upright in them, whatever its direction in the image."""
+"""Patches: the boundary is upright in them, in any direction in the image."""
 
 from __future__ import annotations
 
