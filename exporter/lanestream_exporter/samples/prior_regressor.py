@@ -43,5 +43,5 @@ def load_prior_regressor(path: Path) -> PriorRegressor:
 
 
 def no_regressor(role: ModelRole, _inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Is the `infer` of a search without a prior, which runs no network."""
+    """Stands for `infer` in a search without a prior, which runs no network. Raises AssertionError."""
     raise AssertionError(f"no {role} is loaded")
