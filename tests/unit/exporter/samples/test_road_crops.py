@@ -13,7 +13,7 @@ from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import Curve
 from lanestream.road.view import Image, RoadView
 from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
-from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, sample
+from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, warped_road_crop
 from lanestream_exporter.samples.road_frames import RoadFrame, read_frames, write_frames
 
 WIDTH, HEIGHT, HORIZON = 640, 360, 150.0
@@ -51,15 +51,15 @@ def frame() -> RoadFrame:
         Warp(pan=0.05),
         Warp(side=0.2),
         Warp(zoom=1.15),
-        Warp(bend=0.01),
+        Warp(curvature=0.01),
         Warp(assumed=0.1),
         Warp(flipped=True),
-        Warp(pan=-0.04, side=-0.15, zoom=0.9, bend=-0.01, assumed=-0.05, flipped=True),
+        Warp(pan=-0.04, side=-0.15, zoom=0.9, curvature=-0.01, assumed=-0.05, flipped=True),
     ],
 )
 def test_a_warped_frame_has_its_paint_where_the_target_says(frame: RoadFrame, warp: Warp) -> None:
     geometry = RoadCropGeometry()
-    crop, target = sample(frame, geometry, warp)
+    crop, target = warped_road_crop(frame, geometry, warp)
     view = RoadView(frame.width, frame.height, frame.horizon)
     seen = RoadView(frame.width, frame.height, frame.horizon + warp.assumed * view.depth)
     grid_columns, grid_rows = geometry.grid(seen)

@@ -7,7 +7,7 @@ import torch
 
 from lanestream.detection.ego_prior import RegressorOutput
 from lanestream_exporter.alexnet import Shape
-from lanestream_exporter.regressor import Answer, LaneRegressor, at_shares, lateral_loss, logs_at_shares
+from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction, at_shares, lateral_loss, logs_at_shares
 from lanestream_exporter.samples.road_crops import SHARES
 
 
@@ -21,12 +21,12 @@ def test_the_loss_is_lowest_at_the_truth() -> None:
         "horizon": torch.zeros(4),
     }
     log_sigma, presence = torch.full((4, 2, 3), -5.0), torch.full((4, 2), 8.0)
-    best = lateral_loss(Answer(columns, log_sigma, presence, torch.zeros(4)), truth)
+    best = lateral_loss(RegressorPrediction(columns, log_sigma, presence, torch.zeros(4)), truth)
     for worse in (
-        Answer(columns + 0.02, log_sigma, presence, torch.zeros(4)),
-        Answer(columns, log_sigma + 2.0, presence, torch.zeros(4)),
-        Answer(columns, log_sigma, -presence, torch.zeros(4)),
-        Answer(columns, log_sigma, presence, torch.full((4,), 0.1)),
+        RegressorPrediction(columns + 0.02, log_sigma, presence, torch.zeros(4)),
+        RegressorPrediction(columns, log_sigma + 2.0, presence, torch.zeros(4)),
+        RegressorPrediction(columns, log_sigma, -presence, torch.zeros(4)),
+        RegressorPrediction(columns, log_sigma, presence, torch.full((4,), 0.1)),
     ):
         assert lateral_loss(worse, truth) > best + 0.05
 
@@ -51,4 +51,4 @@ def test_folding_keeps_the_function() -> None:
         folded = network.folded()
         assert not [module for module in folded.modules() if isinstance(module, norms)]
         np.testing.assert_allclose(folded(crops), network(crops), rtol=1e-3, atol=1e-3)
-        assert Answer.of(folded(crops)).told().shape == (2, RegressorOutput.SIZE)
+        assert RegressorPrediction.of(folded(crops)).served().shape == (2, RegressorOutput.SIZE)
