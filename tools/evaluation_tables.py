@@ -34,8 +34,12 @@ def main(path: Path) -> None:
         ),
         ("Steadiness", _STEADINESS, _rows(clips, _steady)),
         ("Lateral error", _LATERAL, _rows(images, _lateral)),
-        ("C. Standard metrics", _METRICS, _rows(images, lambda groups: _metrics(groups["field"]))),
-        ("C. The ego boundaries only", _METRICS, _rows(images, lambda groups: _metrics(groups["field"]["ego"]))),
+        ("C. Benchmark metrics", _METRICS, _rows(images, lambda groups: _metrics(groups["field"]))),
+        (
+            "C. Benchmark metrics of the ego pair only",
+            _METRICS,
+            _rows(images, lambda groups: _metrics(groups["field"]["ego"])),
+        ),
     ):
         click.echo(f"\n**{title}**\n")
         for row in (("", *head), ["---"] * (len(head) + 1), *rows):
@@ -46,7 +50,7 @@ _CANDIDATES = ("precision", "recall", "accuracy", "average precision", "base rat
 _PROPOSAL_RECALL = ("ego, 8", "ego, 16", "ego, 32", "all, 8", "all, 16", "all, 32")
 _BOUNDARIES = ("ego precision", "ego recall", "ego error, px", "all precision", "all recall")
 _STEADINESS = ("both ego boundaries", "jitter, px", "identity switches")
-_LATERAL = ("10 m, px", "over constant", "30 m, px", "over constant", "reached 30 m", "over straight line")
+_LATERAL = ("10 m, px", "ratio to constant", "30 m, px", "ratio to constant", "reached 30 m", "ratio, straight")
 _METRICS = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
 
 

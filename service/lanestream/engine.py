@@ -32,7 +32,7 @@ SHIPPED_REGRESSOR: Final = Path(__file__).parent / "models" / "regressor.onnx"
 class Engine:
     """The models of a process by their roles and the detectors by their names, shared by all its sessions.
 
-    `main_roles` says which model a detector cannot do without. The first detector is the default.
+    `main_roles` names the model that each detector requires. The first detector is the default.
     """
 
     models: Mapping[ModelRole, LoadedModel]
@@ -61,7 +61,7 @@ class Engine:
         return name
 
     def main_model(self, detector: str | None = None) -> LoadedModel:
-        """Returns the model that the `detector`, or the default one, cannot do without. Raises NoDetectorError."""
+        """Returns the model that `detector`, or the default one, requires. Raises NoDetectorError if missing."""
         return self.models[self.main_roles[self.select(detector)]]
 
     def open_session(self, horizon: float | None = None, detector: str | None = None) -> Session:
@@ -72,7 +72,7 @@ class Engine:
         return Session(self.detectors[self.select(detector)], horizon)
 
     def process(self, session: Session, image: Image, timestamp: float) -> FrameResult:
-        """Processes one frame in the calling thread, with the milliseconds of each stage in the result's timing."""
+        """Processes one frame in the calling thread; the result's timing has the milliseconds of each stage."""
         infer_s = 0.0
 
         def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -94,9 +94,9 @@ def load_engine(
 ) -> Engine:
     """Loads the model file at `model`, by default the shipped classifier, and warms it up.
 
-    A classifier works with the `regressor`, which shows it where to search and is a detector itself; None leaves it
-    out. A regressor as the `model` is the only detector. Raises ModelError for a file that cannot be served,
-    ProviderError if `provider` cannot be used.
+    With a classifier the `regressor` provides the ego-lane prior, and is a detector itself; None omits it. A regressor
+    as the `model` is the only detector. Raises ModelError for a file that cannot be served, ProviderError if `provider`
+    cannot be used.
     """
     keep_freed_memory()
     main = load_model(model or SHIPPED_MODEL, provider, options)
@@ -113,7 +113,7 @@ def load_engine(
 
 
 def resolve_regressor(path: Path | None) -> Path | None:
-    """Returns the regressor's file that a user's setting means: the shipped one if None, None for the path `none`."""
+    """Returns the regressor file for a user's setting: the shipped one for None, None for the path `none`."""
     if path is None:
         return SHIPPED_REGRESSOR
     return None if path == Path("none") else path

@@ -1,4 +1,4 @@
-"""The engine in this process, for users who want lanes without a service: images in, the service's messages out."""
+"""The engine in this process, for use without a service: takes images and returns the service's messages."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ if TYPE_CHECKING:
     from lanestream.road.view import Image
     from lanestream.session import Session
 
-# A user's own files may take more memory than a service gives to strangers.
+# A user's own files may use more memory than a service allows its clients.
 _LIMITS: Final = ImageLimits(max_bytes=1 << 28, max_pixels=MOST_PIXELS)
 
 
 class LocalEngine:
-    """A warm engine that works in the calling thread."""
+    """A warm engine that runs in the calling thread."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
 
     @classmethod
     def load(cls, model: Path | None, provider: str, regressor: Path | None = None) -> LocalEngine:
-        """Loads a model file and the regressor, by default the shipped ones; the path `none` leaves the regressor out.
+        """Loads a model file and the regressor, by default the shipped ones; the path `none` omits the regressor.
 
         Raises ModelError and ProviderError.
         """
         return cls(load_engine(model, provider, resolve_regressor(regressor)))
 
     def network(self, detector: str | None = None) -> LoadedModel:
-        """Returns the main model of a detector, by default of the default one. Raises NoDetectorError."""
+        """Returns the main model of `detector`, or of the default one. Raises NoDetectorError if it is not loaded."""
         return self._engine.main_model(detector)
 
     def open_camera(

@@ -16,17 +16,17 @@ from lanestream.road.view import Image
 from lanestream.tracking.state import TrackerState
 from lanestream.tracking.tracker import LaneTracker
 
-# The least weight of a new frame's horizon: bumps should not move the camera's, a minute of driving should.
+# The least weight of a new frame's horizon: bumps should not move the estimate, a minute of driving should.
 _HORIZON_GAIN: Final = 0.1
 
 
 @dataclass(frozen=True)
 class SessionState:
-    """What a session remembers, as a small value.
+    """The state of a session as a small value.
 
-    `size` is the width and height of its working images, `horizon` the camera's and `prior_horizon` the one that the
-    ego-lane prior saw in the last frame, both as shares of the height. `evidence` is how much the frames have said
-    about the horizon.
+    `size` is the width and height of its working images. `horizon` is the camera's estimate and `prior_horizon` the
+    ego-lane prior's in the last frame, both as shares of the height. `evidence` is the sum of the frames' horizon
+    weights.
     """
 
     size: tuple[int, int] | None = None
@@ -54,7 +54,7 @@ class Session:
 
     @property
     def state(self) -> SessionState:
-        """Everything it remembers. Do not read it while a frame is being processed."""
+        """The complete state. Do not read it while a frame is being processed."""
         return SessionState(self._size, self._horizon, self._prior_horizon, self._evidence, self._tracker.state)
 
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
@@ -67,7 +67,7 @@ class Session:
         self._prior_horizon = state.prior_horizon
 
     def process(self, image: Image, timestamp: float, infer: Infer) -> FrameResult:
-        """Returns the lanes of one frame, a BGR image (H, W, 3) uint8, in its pixels.
+        """Returns the lanes of one frame, a BGR image (H, W, 3) uint8, in pixels of that image.
 
         `timestamp` is the capture time in seconds; frames of a session are processed one at a time, in order. The
         result's timing has the milliseconds of `propose` (without waiting for `infer`), `fit` and `track`. If `infer`
@@ -98,7 +98,7 @@ class Session:
         )
 
     def _update_horizon(self, detections: Detections) -> None:
-        """Updates the horizon by a weighted mean of what the frames say that forgets slowly."""
+        """Updates the horizon with a weighted mean of the frames' horizons that forgets old frames slowly."""
         view = detections.view
         size = view.width, view.height
         if self._size not in (None, size):
@@ -114,7 +114,7 @@ class Session:
 
 
 class _TimedInference:
-    """Calls `infer`, and adds up the seconds that the calls take."""
+    """Calls `infer` and sums up the seconds that the calls take."""
 
     def __init__(self, infer: Infer) -> None:
         self._infer = infer

@@ -1,4 +1,4 @@
-"""The candidate detector: many proposals, a patch of each for the classifier, and a fit of those it accepts."""
+"""The candidate detector: proposes candidates, classifies a patch of each, and fits curves to the accepted ones."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from lanestream.road.view import Image, RoadView, visible_spans
 # The column of the classifier's outputs that holds the probability of a boundary.
 BOUNDARY: Final = 1
 
-# At these shares of the depth distances between candidates are compared.
+# Distances between candidates are compared at these shares of the depth.
 _COMPARED: Final = np.array([0.25, 0.5, 1.0])
-# Candidates that are nowhere farther apart than the first, in row offsets, follow the same marking; the position of a
-# marking is the mean of those that are nowhere farther apart than the second, measured across the line.
+# Candidates whose largest distance is at most _SAME, in row offsets, follow the same marking. The position of a marking
+# is the mean of the candidates within _AVERAGED of it, measured across the line.
 _SAME: Final = 0.12
 _AVERAGED: Final = 0.25
-# A boundary of the prior is fitted to the paint to become a candidate if no tracked one, which already is on the paint,
-# is this near, in row offsets.
+# The prior's boundaries are fitted to the paint and become candidates too, except within this distance, in row offsets,
+# of a tracked boundary, which is on the paint already.
 _TRACKED: Final = 0.16
 # hypot(1, slope) of an ego boundary, see `curve_fit`.
 _USUAL_OBLIQUITY: Final = 1.6
-# Of two boundaries that come closer than this, in row offsets, or that cross, one is wrong.
+# If two boundaries come closer than this, in row offsets, or cross, one of them is wrong.
 _CLOSEST: Final = 0.8
 
 
 @dataclass(frozen=True)
 class CandidateDetector:
-    """Accepts candidates from the probability `threshold` on; a `regressor`, if any, shows where to search."""
+    """Accepts candidates whose probability reaches `threshold`. A `regressor`, if given, guides the search."""
 
     threshold: float
     patch: PatchGeometry = PatchGeometry()
@@ -65,7 +65,7 @@ class CandidateDetector:
     def propose(
         self, image: Image, gray: Image, context: FrameContext, infer: Infer, limit: int = MOST_CANDIDATES
     ) -> Proposals:
-        """Returns the candidates of a BGR working image, whose paint is bright in `gray`."""
+        """Returns the candidates of a BGR working image; `gray` is its `paint_gray`."""
         if self.regressor is None:
             return propose(gray, context, None, None, limit)
         horizon = context.horizon if context.prior_horizon is None else context.prior_horizon
@@ -90,7 +90,8 @@ class CandidateDetector:
     def decide(self, gray: Image, proposals: Proposals, outputs: NDArray[np.float32]) -> Detections:
         """Returns the boundaries among `proposals`, given the classifier's outputs (N, 2) for their patches.
 
-        Which candidates are accepted is decided with the prior; where exactly a line runs, the patches say better.
+        The prior influences which candidates are accepted. Their exact position depends on the classifier alone, which
+        is more precise.
         """
         started = time.perf_counter()
         own = outputs[:, BOUNDARY].astype(np.float64)
@@ -119,9 +120,9 @@ class CandidateDetector:
 def _means(
     curves: Curves, probability: FloatArray, gaps: FloatArray, chosen: NDArray[np.intp], view: RoadView
 ) -> Curves:
-    """Returns the mean of each chosen candidate with all that are close to it, less certain ones with less weight.
+    """Returns the weighted mean of each chosen candidate and all candidates close to it.
 
-    Each candidate errs in its own way.
+    Their errors are largely independent. Less probable candidates have less weight.
     """
     rows = view.horizon + ANCHORS * view.depth
     slope = curves.take(chosen).slope(rows[1:2])[:, 0]
@@ -131,9 +132,9 @@ def _means(
 
 
 def _separated(detections: list[Detection], view: RoadView) -> tuple[Detection, ...]:
-    """Returns the detections, given most probable first, that neither cross nor come close to a better one.
+    """Returns the detections that neither cross a more probable one nor come close to it, from left to right.
 
-    They are returned from left to right.
+    `detections` are sorted by falling probability.
     """
     if not detections:
         return ()
@@ -144,7 +145,7 @@ def _separated(detections: list[Detection], view: RoadView) -> tuple[Detection, 
 
 
 def _gaps(curves: Curves, view: RoadView) -> FloatArray:
-    """Returns how far each curve is to the right of each other one at three rows, in row offsets (N, N, 3)."""
+    """Returns how far each curve is to the right of every other one at three rows, in row offsets (N, N, 3)."""
     below = _COMPARED * view.depth
     places = curves.x(view.horizon + below) / below
     return np.asarray(places[:, None] - places)

@@ -1,10 +1,10 @@
-"""The joint curve fit: moves the boundaries of a frame onto their paint, all together, to a fraction of a pixel.
+"""The joint curve fit: moves all boundaries of a frame onto their paint together, to a fraction of a pixel.
 
 The marking filter finds bright bars row by row on a strip along each curve, and reweighted least squares pulls the
-curve onto them. Where paint is missing the curve itself is the prior, and so is the road that it shares with the
-others: on a flat road all boundaries have one vanishing point, one horizon and one curvature. A dashed line keeps its
-direction, and a far end behind a car has that of its neighbors. Between the two stripes of a double line lies its
-middle.
+curve onto them. Where paint is missing, two priors apply: the curve itself, and the road that it shares with the other
+boundaries. On a flat road all boundaries have one vanishing point, one horizon and one curvature. So a dashed line
+keeps its direction, and a far end behind a car follows its neighbors. A fit on one stripe of a double line is moved to
+the middle between both stripes.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _MARKING_WIDTHS: Final = (0.05, 0.1, 0.17)
 # Rows of a strip, from the bottom up to this share of the depth.
 _ROWS: Final = 48
 _TOP_SHARE: Final = 0.06
-# A bar's weight is relative to the strip's best rows: the best tenth, by this factor.
+# The weight of a bar is relative to the contrast of the strip's best rows, this share of them, times this factor.
 _BEST_ROWS: Final = 0.1
 _BEST_FACTOR: Final = 0.4
 # The center of a bar in one row is known to this many pixels, plus this share of the row offset.
 _ROW_NOISE: Final = 1.0
 _BLUR: Final = 0.012
-# Nearer to the horizon than this share of the depth the curvature term has no bounds, and paint says nothing of it.
+# Closer to the horizon than this share of the depth, the curvature term is unbounded and paint does not determine it.
 _FARTHEST: Final = 0.04
-# Neighboring rows share their errors: about four of them are worth one.
+# Errors of neighboring rows are correlated: about four rows carry the information of one.
 _CORRELATED_ROWS: Final = 4.0
 # A candidate's columns at the anchors are known to about this, in depths.
 _CANDIDATE_SIGMA: Final = np.array([0.03, 0.02, 0.1])
@@ -48,19 +48,21 @@ _CANDIDATE_SIGMA: Final = np.array([0.03, 0.02, 0.1])
 # depths; on a curving road also within this share of its curvature, because the inner boundary curves more sharply.
 _COMMON_SIGMA: Final = np.array([0.003, 0.0006])
 _CURVING_SHARE: Final = 0.1
-# A boundary this many deviations from the common road counts half: it is part of another road, or not a boundary.
+# A boundary this many sigmas from the common road has half the weight: it belongs to another road, or is not a
+# boundary.
 _OUTLIER: Final = 3.0
-# Before the fit the road's column, horizon and curvature are known to this, in depths; the horizon moves no farther.
+# The sigmas of the road's column, horizon and curvature before the fit, and the most that the horizon may move, in
+# depths.
 _ROAD_SIGMA: Final = np.array([0.1, 0.03, 0.03])
 _MOST_PITCH: Final = 0.04
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How far from the curve paint is looked for, and how strictly.
+    """How far from the curve the fit searches for paint, and how strictly.
 
-    Strips reach `reach` to either side in `cells` cells. In each of the `rounds` bars at this distance from the curve
-    have a quarter of their weight. With `move_horizon` the horizon is fitted too.
+    Strips extend `reach` to either side, in `cells` cells. Each of the `rounds` is the distance from the curve at which
+    a bar has a quarter of its weight in that round. With `move_horizon` the horizon is fitted too.
     """
 
     reach: float = 0.16
@@ -139,15 +141,15 @@ class _Strips:
         strips = np.asarray(warped, np.uint8).reshape(columns.shape)
         per_cell = (cells - 1) / float(self.across[-1] - self.across[0])
         contrast = np.empty(strips.shape, np.float32)
-        # A strip that is wider by its obliquity has narrower bars; strips with bars of one width are filtered together.
+        # A strip that is wider by its obliquity has narrower bars; strips with equal bar widths are filtered together.
         groups: dict[tuple[int, ...], list[int]] = {}
         for index, obliquity in enumerate(self.obliquity.tolist()):
             groups.setdefault(tuple(max(1, round(w / obliquity * per_cell)) | 1 for w in widths), []).append(index)
         for bar_widths, members in groups.items():
             filtered = bar_contrast(strips[members].reshape(-1, cells), bar_widths)
             contrast[members] = filtered.reshape(len(members), -1, cells)
-        # Five gray levels above its own row's texture is a bar that a person would see. Squared: a few bright dots
-        # count for more than a wheel track that is a little lighter all along.
+        # A bar five gray levels above the texture of its row is visible to a person. Weights are squared, so that a few
+        # bright dots outweigh a wheel track that is slightly lighter over its whole length.
         texture = np.abs(contrast).mean(axis=2, keepdims=True)
         place = int((1.0 - _BEST_ROWS) * (self.y.shape[1] - 1))
         best = np.maximum(np.partition(contrast.max(axis=2), place, axis=1)[:, place], 0.0)
@@ -161,8 +163,8 @@ class _JointFit:
     """Least squares over all boundaries of a frame and the road that they share.
 
     Boundary n is x(t) = v + b t + c / t with t = u / depth: its `theta` (3,) are v, b and c = k / depth, all in pixels.
-    The road is V, H, C: the column of its vanishing point, the rows by which its horizon is below the present one, and
-    its curvature. Two constraints tie each boundary to it: v + dv/dh H = V and c + dc/dh H = C.
+    The road is V, H, C: the column of its vanishing point, how many rows its horizon is below the current one, and its
+    curvature. Two constraints tie each boundary to it: v + dv/dh H = V and c + dc/dh H = C.
     """
 
     def __init__(
@@ -192,7 +194,7 @@ class _JointFit:
         constraints[indices, 0, 3 * indices] = constraints[indices, 1, 3 * indices + 2] = 1.0
         constraints[:, 0, -3] = constraints[:, 1, -1] = -1.0
         self._constraints = constraints
-        # Where in the flat normal matrix the block of each boundary is, and the diagonal of the road.
+        # The positions of each boundary's block and of the road's diagonal in the flattened normal matrix.
         size = 3 * number + 3
         within = size * np.arange(3)[:, None] + np.arange(3)
         self._blocks = (3 * (size + 1) * indices)[:, None, None] + within
@@ -241,7 +243,7 @@ class _JointFit:
     def _paint(
         self, row_basis: FloatArray, start: FloatArray, theta: FloatArray, reach: float, horizon: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Returns what the bars near the curves `theta` (N, 3) say: normal equations (N, 3, 3) and (N, 3) of shifts."""
+        """Returns normal equations (N, 3, 3) and (N, 3) of the shifts, from the bars near the curves `theta` (N, 3)."""
         strips = self._strips
         both = row_basis @ np.stack([theta, start], axis=2)
         place = ((both[:, :, 0] - strips.x) / self._scale).astype(np.float32)
@@ -296,19 +298,19 @@ def _basis(t: FloatArray) -> FloatArray:
 
 # --- Double lines ---------------------------------------------------------------------------------------------------
 
-# A fit settles on the stripe that is seen better, on one in this frame and on the other in the next. Along the fit both
-# stripes are straight, so their contrast adds up over the rows, and each is a peak of the mean row. Strips along a fit:
-# reach, cells, rows, nearest share of the depth, widths of stripes.
+# A fit settles on the stripe with more contrast, which may be another one in the next frame. Along the fit both stripes
+# are straight, so their contrast adds up over the rows, and each is a peak of the mean row. The strips along a fit have
+# this reach, these numbers of cells and rows, this highest row as a share of the depth, and these widths of stripes.
 _STRIPE_REACH, _STRIPE_CELLS, _STRIPE_ROWS, _STRIPE_TOP_SHARE = 0.4, 129, 24, 0.2
 _STRIPE_WIDTHS: Final = (0.05, 0.09)
-# A stripe has this contrast in this share of the rows, and is no farther than this from the fit. The stripes of a
-# double line are this far apart.
+# A stripe has at least this contrast in this share of the rows, and is within this distance of the fit. The distance
+# between the stripes of a double line is in this range.
 _STRIPE_CONTRAST, _STRIPE_SHARE, _STRIPE_FARTHEST = 0.06, 0.3, 0.2
 _STRIPE_GAPS: Final = (0.07, 0.25)
 
 
 def _between_stripes(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArray) -> Curves:
-    """Returns the fitted curves, those on a stripe of a double line moved to the middle between its stripes."""
+    """Returns the fitted curves; a curve on a stripe of a double line is moved to the middle between its stripes."""
     view = fits.view
     visible = visible_spans(fits.curves, view, _STRIPE_TOP_SHARE)
     top = np.where(visible.visible, visible.top, top)
@@ -316,7 +318,7 @@ def _between_stripes(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArra
     strips = _Strips.along(fits.curves, top, bottom, view, _STRIPE_REACH, _STRIPE_CELLS, _STRIPE_ROWS)
     bars = strips.bars(gray, _STRIPE_WIDTHS)
     mean = bars.mean(axis=1)
-    # A fit that is a little off lets a stripe move from cell to cell.
+    # If the fit is slightly off, the stripe crosses from one cell to the next.
     shown = (bars > _STRIPE_CONTRAST).astype(np.uint8)
     shown = np.asarray(cv2.dilate(shown.reshape(-1, _STRIPE_CELLS), np.ones((1, 3), np.uint8)), np.uint8)
     is_stripe = (mean[:, 1:-1] >= mean[:, :-2]) & (mean[:, 1:-1] > mean[:, 2:])
@@ -328,12 +330,12 @@ def _between_stripes(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArra
         # The clearest stripe first.
         stripes = strips.across[cells[np.argsort(-mean[index, cells], kind="stable")]].tolist()
         shift[index] = _middle(stripes) * strips.obliquity[index]
-    # Moved by a share of the row offset, a curve moves equally far on the ground everywhere.
+    # A shift proportional to the row offset is a constant shift on the ground.
     return Curves(fits.curves.horizon, fits.curves.coefficients + shift[:, None] * np.array([0.0, 1.0, 0.0]))
 
 
 def _middle(stripes: Sequence[float]) -> float:
-    """Returns the middle between the stripe nearest to the fit and the clearest one that may belong to it; else 0."""
+    """Returns the middle between the stripe nearest to the fit and its clearest possible partner, or 0 without one."""
     nearest = min(stripes, key=abs)
     closest, farthest = _STRIPE_GAPS
     others = [stripe for stripe in stripes if closest <= abs(stripe - nearest) <= farthest]

@@ -14,11 +14,11 @@ from lanestream.road.crops import PatchGeometry, RoadCropGeometry
 
 
 class ClassifierDescription(Protocol):
-    """What a classifier's model file says that its detector needs."""
+    """The part of a classifier's description that its detector needs."""
 
     @property
     def threshold(self) -> float:
-        """The probability from which on a candidate is accepted."""
+        """The probability from which a candidate is accepted."""
 
     @property
     def patch(self) -> PatchGeometry:
@@ -26,11 +26,11 @@ class ClassifierDescription(Protocol):
 
 
 class RegressorDescription(Protocol):
-    """What a regressor's model file says that its detector needs."""
+    """The part of a regressor's description that its detector needs."""
 
     @property
     def threshold(self) -> float:
-        """The presence from which on a boundary is reported."""
+        """The presence from which a boundary is reported."""
 
     @property
     def road_crop(self) -> RoadCropGeometry:
@@ -47,7 +47,7 @@ class ModelDescriptions:
 
 @dataclass(frozen=True)
 class DetectorSpec:
-    """A detector by the name that users ask for, the model that it cannot do without, and how to build it.
+    """A detector: the name by which users request it, the model that it requires, and how to build it.
 
     `build` returns None if that model is not loaded.
     """

@@ -1,7 +1,7 @@
 """The ego-lane prior: where the regressor sees the two boundaries of the ego lane, and how certain it is.
 
-The regressor looks at the crop of the whole road, in which the horizon always has the same row. It returns where both
-boundaries run, their standard deviations, whether each is there, and where the horizon really is. The regression
+The regressor's input is the crop of the whole road, in which the horizon always has the same row. It returns where both
+boundaries run, their standard deviations, whether each exists, and where the horizon really is. The regression
 detector reports these boundaries; the candidate detector searches around them.
 """
 
@@ -27,16 +27,16 @@ REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
 # Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each.
 UNKNOWN_HORIZONS: Final = (0.32, 0.39, 0.46, 0.53, 0.6)
 
-# Above the first mean deviation, in image widths, the network looks at the mirrored crop too. A boundary with a larger
-# deviation than the second is not used for the search: the network has not seen such a road.
+# If the mean sigma, in image widths, is above the first limit, the network also runs on the mirrored crop. A boundary
+# whose sigma is above the second limit is not used for the search: the network does not know such roads.
 _UNCERTAIN: Final = 0.022
 _MOST_UNCERTAIN: Final = 0.1
-# At these anchors lateral positions are compared: farther away all lines of a road are close together.
+# Lateral positions are compared at these anchors: farther away all lines of a road are close together.
 _COMPARED: Final = REGRESSOR_ANCHORS[:2]
-# No boundary is known more exactly than this, in row offsets.
+# The smallest sigma of a boundary, in row offsets.
 _LEAST_SIGMA: Final = 0.02
-# How many times likelier a line is a boundary if it is a whole number of lanes beside the ego lane, and the share of
-# that if it is far from such a position: feet of walls and edges of the pavement run there, and hardly a boundary.
+# The odds factor of a line a whole number of lane widths from the ego lane, and the share of it for a line far from
+# such a position: the feet of walls and the edges of pavements run there, but hardly any boundary.
 _SPACED_ODDS: Final = 1.5
 _UNSPACED_SHARE: Final = 0.05
 
@@ -108,22 +108,22 @@ class EgoPrior:
 
     @property
     def vanishing_point(self) -> VanishingPoint:
-        """What the boundaries share. There must be one."""
+        """The mean vanishing point of the boundaries, of which there must be at least one."""
         v, _, k = self.curves.coefficients.mean(axis=0).tolist()
         return VanishingPoint(v, self.view.horizon, k, 1.0)
 
     def spacing(self, places: FloatArray, least: float) -> LaneSpacing:
-        """Returns the lanes beside the ego lane, whose boundaries have the lateral `places` (M,). There must be one."""
+        """Returns the lane-spacing model of an ego lane whose boundaries (M,), at least one, are at `places`."""
         at = dict(zip(self.sides, places.tolist(), strict=True))
         left = at[-1] if -1 in at else at[1] - USUAL_LANE_WIDTH
         right = at[1] if 1 in at else at[-1] + USUAL_LANE_WIDTH
         return LaneSpacing(left, right, least)
 
     def odds(self, curves: Curves) -> FloatArray:
-        """Returns how many times likelier (N,) `curves` are boundaries because of where they run; 1 is neutral.
+        """Returns the factors (N,) by which their positions change the odds of `curves` to be boundaries.
 
-        Roads have a boundary every lane width. The ego lane has one where the prior saw it, within its deviation (with
-        the heavy tail of Student's t with three degrees of freedom), and none between its own two.
+        Roads have a boundary every lane width. The ego lane has its boundaries where the prior saw them, within their
+        sigma (with the heavy tail of Student's t with three degrees of freedom), and none between them.
         """
         below = _COMPARED * self.view.depth
         rows = self.view.horizon + below
@@ -142,25 +142,25 @@ class EgoPrior:
 
 @dataclass(frozen=True)
 class LaneSpacing:
-    """The lane-spacing model: boundaries repeat every lane width beside the ego lane's `left` and `right`.
+    """The lane-spacing model: boundaries repeat every lane width outwards from the ego lane's `left` and `right`.
 
-    All are lateral positions in columns per row offset. A line between such positions has the weight `least`.
+    Lateral positions are in columns per row offset. A line far from all repeated positions has the weight `least`.
     """
 
     left: float
     right: float
     least: float
 
-    # A line so many lane widths off a boundary's position has most of its weight left; lanes beyond the next ones
-    # count less, since roads widen and end.
+    # Standard deviation of a boundary's position in lane widths. Positions beyond the adjacent lanes weigh less,
+    # because lanes begin and end there.
     _TOLERANCE = 0.12
     _OUTER_WEIGHT = 0.6
-    # The width of the ego lane, if it is a lane at all.
+    # Limits of the lane width.
     _WIDTHS = (1.2, 4.5)
 
     @property
     def width(self) -> float:
-        """The lane width, limited to what lanes are."""
+        """The lane width, within plausible limits."""
         narrowest, widest = self._WIDTHS
         return min(max(self.right - self.left, narrowest), widest)
 
@@ -183,7 +183,7 @@ class LaneSpacing:
 class RoadRegressor:
     """Prepares the regressor's inputs and reads its outputs.
 
-    A boundary is reported from the presence `threshold` on.
+    A boundary is used if its presence reaches `threshold`.
     """
 
     threshold: float
@@ -192,7 +192,8 @@ class RoadRegressor:
     def predict(self, image: Image, horizon: float | None, infer: Infer) -> tuple[RegressorOutput, RoadView]:
         """Returns the output for a BGR working image, and the view with the horizon that the network sees.
 
-        `horizon` is about its row. If it is None the network tries several, and looks again where it was most certain.
+        `horizon` is its approximate row. If it is None, the network runs once for each of several rows, and again near
+        the one with the least uncertainty.
         """
         height, width = image.shape[:2]
         detail = resized(image, self.geometry.detail_width / width)
@@ -218,7 +219,7 @@ class RoadRegressor:
         return np.asarray(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def prior(self, output: RegressorOutput, view: RoadView) -> EgoPrior:
-        """Returns the boundaries of an output that are present and certain enough to search around."""
+        """Returns the boundaries of an output that are present and certain enough to guide the search."""
         seen = (output.presence >= self.threshold) & (output.sigma.mean(axis=1) <= _MOST_UNCERTAIN)
         sigma = output.sigma[seen, : len(_COMPARED)] * view.width / (_COMPARED * view.depth)
         sides = _sides(seen.tolist())

@@ -29,7 +29,7 @@ _MOST_SLOPE: Final = 7.0
 _FLATTEST: Final = math.degrees(math.atan(_MOST_SLOPE))
 _LEAST_VOTES: Final = 6.0
 _MOST_LINES: Final = 80
-# Columns by which the angle axis continues at either end, so that peaks there have all their neighbors.
+# The angle axis is padded by this many columns at either end, so that peaks there have all their neighbors.
 _PAD: Final = 3
 
 
@@ -53,7 +53,7 @@ class HoughLines:
 def hough_lines(edges: Edges, width: int, bottom: float) -> HoughLines:
     """Returns the lines in `edges` of an image `width` pixels wide, with their columns at the row `bottom`."""
     origin_x = (width - 1) / 2.0
-    # The other pixels cannot belong to a line that is steep enough, and would only cost votes.
+    # The other pixels cannot belong to a line that is steep enough; their votes would only cost time.
     steep = np.flatnonzero(_from_upright(edges.angle) <= _FLATTEST)
     if not len(steep):
         nothing = np.empty(0)
@@ -146,7 +146,7 @@ def _peaks(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Returns (rho index, theta in degrees, votes) of the strongest local maxima, to a fraction of a cell."""
     smooth = np.asarray(cv2.GaussianBlur(accumulator, (3, 3), 0.7), dtype=np.float32)
-    # Few cells have enough votes, so only those are compared with their neighbors, two cells to either side.
+    # Few cells have enough votes. Only these are compared with their neighbors, up to two cells away.
     high = np.flatnonzero(smooth >= _LEAST_VOTES)
     rows, columns = np.divmod(high, smooth.shape[1])
     theta = columns - _PAD

@@ -1,6 +1,6 @@
 """What all detectors share: a detector takes one working image and returns the lane boundaries in it.
 
-It asks for network outputs through a callable that it is given, and knows nothing of runtimes, batches and threads.
+It gets network outputs through a callable and does not depend on runtimes, batching or threads.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Infer = Callable[[ModelRole, NDArray[np.uint8]], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class FrameContext:
-    """What is known of a frame before it is looked at, in pixels of the working image.
+    """What is known about a frame before detection, in pixels of the working image.
 
     `horizon` is its row, `tracked` are the boundaries of the last frame, and `prior_horizon` is the row that the
-    ego-lane prior of the last frame saw; each is None if unknown. The prior's row is the steadier one: boundaries on
-    the road move the other.
+    ego-lane prior of the last frame gave; each is None if unknown. The prior's row is steadier, because it does not
+    depend on which boundaries are found.
     """
 
     horizon: float | None = None
@@ -40,8 +40,8 @@ class FrameContext:
 class Detections:
     """The boundaries of one frame from left to right, in pixels of the working image.
 
-    `view` has the horizon that fits them best, `horizon_weight` (0 to 1) is how much the frame says about its horizon,
-    `prior_horizon` the row for the next frame's context. `fit_s` are the seconds that fitting curves took.
+    `view` has the horizon that fits them best, `horizon_weight` (0 to 1) is how much the frame reveals about its
+    horizon, `prior_horizon` is the row for the next frame's context, and `fit_s` the seconds spent on fitting curves.
     """
 
     boundaries: tuple[Detection, ...]

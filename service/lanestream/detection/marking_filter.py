@@ -1,7 +1,7 @@
 """The marking filter: finds narrow bright bars between darker sides, which is what painted markings are, row by row.
 
-It runs on images whose rows are resampled in proportion to their row offset, so that a marking is equally wide in every
-row: on the road unrolled around its vanishing point, and on strips along single curves.
+It runs on images whose rows are resampled in proportion to their row offset, so that a marking has the same width in
+every row: on the road unrolled around its vanishing point, and on strips along single curves.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ TOP_SHARE: Final = 0.08
 
 # Markings are about as wide as one of these.
 _WIDTHS: Final = (0.06, 0.12)
-# Contrast is relative to the road's own texture, which has about 1. A ridge has at least the first; none is more
-# certain than at the second.
+# Contrast is relative to the texture of the road. A ridge has at least the first value; from the second value on its
+# weight is 1.
 _LEAST_CONTRAST: Final = 0.5
 _FULL_CONTRAST: Final = 3.0
 # Ridges of one row are at least this far apart.
@@ -70,7 +70,7 @@ def bar_contrast(image: NDArray[Any], widths: Sequence[int], gap: float = 0.0) -
 
 
 def find_ridges(gray: Image, point: VanishingPoint) -> Ridges:
-    """Returns the ridges of a gray working image (H, W), whose road has about the vanishing point `point`."""
+    """Returns the ridges of a gray working image (H, W) whose road has approximately the vanishing point `point`."""
     height, width = gray.shape
     rows = np.linspace(point.y + TOP_SHARE * (height - 1.0 - point.y), height - 1.0, ROWS)
     places = np.arange(-REACH, REACH + STEP / 2, STEP)

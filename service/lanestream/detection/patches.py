@@ -1,6 +1,6 @@
 """Patches: the image strip along each candidate, warped to the classifier's input, with the boundary upright in it.
 
-Training and serving cut their patches here, so that the network sees in service what it saw in training.
+Training and serving both cut their patches here, so the network sees the same kind of input in both.
 """
 
 from __future__ import annotations

@@ -28,16 +28,17 @@ from lanestream.road.view import Image, RoadView, Spans, visible_spans
 MOST_CANDIDATES: Final = 16
 MOST_WITH_TRACKS: Final = 12
 
-# Candidates nearer than this, in row offsets, at two rows are duplicates; the rows are shares of the depth.
+# Candidates closer than this, in row offsets, at both rows of _COMPARED (shares of the depth) are duplicates.
 _SEPARATION: Final = 0.05
 _COMPARED: Final = np.array([1.0, 0.45])
-# Relative to the strongest line, weaker ones are hardly ever boundaries.
+# Lines weaker than this, relative to the strongest one, are hardly ever boundaries.
 _LEAST_STRENGTH: Final = 0.06
-# Lines between the positions where boundaries repeat have this share of their strength.
+# Lines far from the positions of the lane-spacing model keep this share of their strength.
 _UNSPACED_SHARE: Final = 0.3
-# A candidate is visible for this share of the depth at least.
+# A candidate is visible over at least this share of the depth.
 _SHORTEST: Final = 0.15
-# A horizon below this share of the height leaves no road to look at. Without any hint it is above this one.
+# A horizon below the first share of the height leaves no road to search. If the horizon is unknown, edges are used from
+# the second share down.
 _LOWEST_HORIZON: Final = 0.9
 _HIGHEST_ROAD: Final = 0.42
 
@@ -47,7 +48,7 @@ class Proposals:
     """The candidates of a frame, best first, in pixels of the working image.
 
     All `curves` (N) share the horizon of `view` and are visible within `spans`. `horizon_weight` (0 to 1) is how much
-    the frame says about its horizon; `prior` is the ego-lane prior that guided the search, if any.
+    the frame reveals about its horizon; `prior` is the ego-lane prior that guided the search, if any.
     """
 
     curves: Curves
@@ -118,7 +119,7 @@ def _search_road(gray: Image, context: FrameContext, prior: EgoPrior | None) -> 
         return _Road(refine(prior.vanishing_point, ridges, width, height - 1.0, NEAR_PRIOR), ridges)
     horizon = context.horizon
     if horizon is not None:
-        # A prior that sees no boundary in the dark, or in a sharp bend, still sees where the road ends.
+        # A prior without boundaries, in the dark or in a sharp curve, still gives the horizon.
         horizon = min(horizon if prior is None else prior.view.horizon, _LOWEST_HORIZON * height)
     top = _HIGHEST_ROAD * height if horizon is None else horizon
     lines = hough_lines(find_edges(gray, int(np.clip(top, 0, height - 16))), width, height - 1.0)
@@ -136,10 +137,10 @@ def _normalized(strength: FloatArray) -> FloatArray:
 def are_duplicates(
     curves: Curves, others: Curves, view: RoadView, separation: float = _SEPARATION
 ) -> NDArray[np.bool_]:
-    """Returns for each curve (N, M) which of the `others` are nearer than `separation`, in row offsets, at two rows.
+    """Returns a mask (N, M): which of the `others` are closer to each curve than `separation` at both rows.
 
-    By default that is near enough to follow the same marking. Oblique lines are closer together than their columns are
-    apart, so distances are measured across the other line.
+    `separation` is in row offsets; curves within the default follow the same marking. Oblique lines are closer to each
+    other than their columns are, so distances are measured across the other line.
     """
     below = _COMPARED * view.depth
     rows = view.horizon + below
@@ -150,9 +151,9 @@ def are_duplicates(
 
 
 def non_maximum_suppression(conflicts: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Returns the indices of those, best first, that are not in conflict with a better one that is kept.
+    """Returns the indices of the items that no better accepted item conflicts with, best first.
 
-    `conflicts` (N, N) says which exclude each other, ordered from the best to the worst.
+    `conflicts` (N, N) marks pairs that exclude each other; items are sorted from best to worst.
     """
     free = np.ones(len(conflicts), bool)
     kept = []

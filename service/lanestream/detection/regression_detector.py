@@ -1,4 +1,4 @@
-"""The regression detector: one look at the whole frame gives the two boundaries of the ego lane."""
+"""The regression detector: finds the two boundaries of the ego lane in one pass over the whole frame."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from lanestream.detection.interface import Detections, FrameContext, Infer
 from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_spans
 
-# The network's curves are farther from the paint than candidates are, so paint is looked for farther away.
+# The network's curves are less exact than candidates, so the fit searches for paint farther away.
 _FIT: Final = FitSettings(reach=0.24, rounds=(0.09, 0.06, 0.04, 0.04))
-# Paint moves a boundary within this many of the network's deviations, but no boundary is known better than this, in
-# depths.
+# The fit's prior is the network's curve with its sigma times this factor, and at least this sigma, in depths.
 _SIGMA_FACTOR: Final = 1.5
 _LEAST_SIGMA: Final = 0.003
 
@@ -54,7 +53,7 @@ class RegressionDetector:
 def fit_output(
     gray: Image, output: RegressorOutput, view: RoadView, threshold: float, sides: Sequence[int] = (0, 1)
 ) -> tuple[list[int], Fits]:
-    """Fits those of the output's boundaries (0 left, 1 right) among `sides` that are present to the paint under them.
+    """Fits the present boundaries of an output (0 left, 1 right) among `sides` to the paint under them.
 
     Returns the sides that were fitted, and their fits. `view` has the network's horizon.
     """

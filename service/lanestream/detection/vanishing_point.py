@@ -3,7 +3,7 @@
 On a flat road of constant curvature every boundary is x(y) = v + b u + k / u with u = y - h: v, h and k belong to the
 road, b to the boundary (the hyperbola-pair model: K. Kluge, "Extracting road curvature and orientation from image edge
 points without perceptual grouping into features", 1994). With the right v, h and k the ridges of all markings gather at
-a few values of b. So the three are searched for by how sharply the ridges gather, and the lines are the peaks.
+a few values of b. The search maximizes how sharply the ridges gather; the peaks are the lines.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from lanestream.detection.hough import HoughLines
 from lanestream.detection.marking_filter import REACH, STEP, Ridges
 from lanestream.road.curve import FloatArray, VanishingPoint
 
-# --- From Hough lines, if nothing else says where the road vanishes -------------------------------------------------
+# --- From Hough lines, if there is no prior -------------------------------------------------------------------------
 
-# A line supports a point with a Cauchy weight of its distance in these image widths.
+# A line supports a point with a Cauchy weight; this is its scale in image widths.
 _TOLERANCE: Final = 0.012
 # The horizon's row as a fraction of the height: its limits, where cameras usually have it, and the standard deviation.
 _HIGHEST, _LOWEST, _USUAL, _SPREAD = 0.2, 0.72, 0.46, 0.16
@@ -86,16 +86,16 @@ def _least_squares_step(
     return x + float(np.clip(move[0], -limit, limit)), y + float(np.clip(move[1], -limit, limit))
 
 
-# --- Refined by the ridges ------------------------------------------------------------------------------------------
+# --- Refinement by the ridges ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class SearchRange:
-    """How far around a first guess the vanishing point and the curvature are searched for.
+    """The range around a first guess in which the vanishing point and the curvature are searched for.
 
-    `x` and `y` are in image widths, `curvature` in depths (k over the squared depth). Each of `rounds` (number, share)
-    tries so many values of all three within this share of the range around the best ones so far, on the strongest
-    `ridges`.
+    `x` and `y` are in image widths; `curvature` is k over the squared depth. The search uses the strongest `ridges`.
+    Each of the `rounds` (number, share) tries this number of values of all three, within this share of the range around
+    the best values so far.
     """
 
     x: float
@@ -106,14 +106,14 @@ class SearchRange:
 
 
 WIDE: Final = SearchRange(0.12, 0.1, 0.06, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
-# If the horizon is known, its row is at most a pitch movement of the vehicle away.
+# A known horizon moves only with the vehicle's pitch.
 KNOWN_HORIZON: Final = SearchRange(0.12, 0.02, 0.06, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
 NEAR_PRIOR: Final = SearchRange(0.03, 0.01, 0.015, 300, ((3, 0.7), (3, 0.35), (3, 0.12)))
 
-# Ridges gather in cells of this many image widths on the bottom row, up to so many image widths from the middle.
+# The histogram on the bottom row: the width of a cell, and its reach from the middle, both in image widths.
 _CELL: Final = 0.012
 _CELLS_REACH: Final = 3.0
-# The share of the best score that a hypothesis at the end of its range must make up for.
+# The penalty of a hypothesis at the end of its range, as a share of the best score.
 _PRIOR_PENALTY: Final = 0.15
 _FEWEST_RIDGES: Final = 8
 
@@ -141,8 +141,8 @@ def _sharpness(axes: FloatArray, ridges: Ridges, width: int, bottom: float) -> N
     """Returns how sharply the ridges gather for each hypothesis: the variance of a histogram about its smooth self.
 
     `axes` (3, S) are the hypotheses' x, y and curvatures; the result is (S, S, S). The histogram counts where the
-    boundaries through the ridges cross the bottom row. Scattered points give the same variance however far a hypothesis
-    draws them together, so a high horizon has no advantage.
+    boundaries through the ridges cross the bottom row. Scattered points have the same variance however closely a
+    hypothesis packs them, so a high horizon has no advantage.
     """
     # Single precision: a hundredth of a pixel on the bottom row, in half the time.
     x, y, curvature = axes.astype(np.float32)
@@ -167,9 +167,10 @@ def _sharpness(axes: FloatArray, ridges: Ridges, width: int, bottom: float) -> N
     return sharpness.reshape((axes.shape[1],) * 3)
 
 
-# --- Lines through it -----------------------------------------------------------------------------------------------
+# --- Lines through the vanishing point ------------------------------------------------------------------------------
 
-# A ridge votes for lines this near; two lines are at least so far apart. Both are lateral positions, as `b` is.
+# A ridge votes for lines within the first distance; two lines are at least the second apart. Both are differences of
+# the lateral position b.
 _VOTE_WIDTH: Final = 0.08
 _SEPARATION: Final = 0.16
 _MOST_LINES: Final = 24
@@ -189,12 +190,12 @@ class FoundLines:
 def find_lines(ridges: Ridges, point: VanishingPoint, width: int) -> FoundLines:
     """Returns the strongest lines through `point` in an image `width` pixels wide.
 
-    This is a Hough transform in one dimension: each ridge votes for the one lateral position it would belong to. It
-    gathers what dashes and dots leave over all rows.
+    This is a Hough transform in one dimension: each ridge votes for the lateral position of the line through it. The
+    votes of dashes and dots add up over all rows.
     """
     cells = np.arange(-REACH, REACH + STEP / 2, STEP)
     votes = _votes(point.places(ridges.x, ridges.y), ridges.weight, len(cells))
-    # Short stretches near the image's side would win on a few rows, so the mean includes rows without anything.
+    # Lines that are visible in few rows, near the sides of the image, would win, so the mean includes some empty rows.
     profile = votes / (_visible_rows(cells, ridges.rows, point, width) + 0.2 * len(ridges.rows))
     window = 2 * max(1, round(_SEPARATION / STEP / 2)) + 1
     highest = cv2.dilate(profile.reshape(1, -1), np.ones((1, window), np.uint8)).ravel()
@@ -207,7 +208,7 @@ def _votes(places: FloatArray, weight: FloatArray, cells: int) -> FloatArray:
     """Returns a smooth histogram (cells,) of the ridges' lateral positions, each counted in its two nearest cells."""
     position = np.clip((places + REACH) / STEP, 0.0, cells - 1.001)
     cell = position.astype(int)
-    # Squared: a few bright dots count for more than a wheel track that is a little lighter all along.
+    # Squared, so that a few bright dots outweigh a wheel track that is slightly lighter over its whole length.
     right = (position - cell) * weight**2
     counts = np.bincount(cell, weight**2 - right, cells) + np.bincount(cell + 1, right, cells)
     return np.convolve(counts, np.hanning(2 * round(_VOTE_WIDTH / STEP) + 1), mode="same")

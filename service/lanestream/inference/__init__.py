@@ -2,5 +2,5 @@
 
 import os
 
-# onnxruntime reports its use to Microsoft from its first import on, unless this is set. A user's own setting stays.
+# onnxruntime reports its use to Microsoft from its first import on, unless this is set. A user's own setting is kept.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -1,8 +1,8 @@
 """The batcher: runs the inference requests of many cameras together, one batch at a time.
 
 It is work-conserving: when the device is free it runs what is waiting, up to the model's largest batch, and never waits
-for more. So a single camera does not pay for company that it does not have. A camera has one request at a time, hence
-first come, first served is fair between cameras.
+for more requests, so batching costs a single camera nothing. A camera has one request at a time, so first come, first
+served is fair between cameras.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class InferenceResult:
 class InferenceRequest:
     """Inputs (N, size, size, 3) for a model, and the future of its result.
 
-    After `deadline` (monotonic seconds) nobody needs the result.
+    After `deadline` (monotonic seconds) the result is no longer needed.
     """
 
     model: RunnableModel
@@ -109,7 +109,7 @@ class RequestQueue:
 
 @dataclass(frozen=True)
 class _Batch:
-    """The requests of one run, the ones that expired before it, and how many still wait."""
+    """The requests of one run, those that expired before it, and the number that still wait."""
 
     requests: list[InferenceRequest]
     expired: list[InferenceRequest]
@@ -117,9 +117,9 @@ class _Batch:
 
 
 class Batcher:
-    """Runs requests in its own thread, or in that of a caller who waits. `observe`, if given, gets every run's report.
+    """Runs requests in its own thread or in that of a waiting caller. `observe`, if given, gets a report of every run.
 
-    A model may run in any thread, as long as only one runs at a time.
+    Models may run in any thread; the batcher runs one batch at a time.
     """
 
     def __init__(self, observe: Callable[[BatchReport], None] | None = None) -> None:
@@ -147,8 +147,9 @@ class Batcher:
     def run(self, model: RunnableModel, inputs: NDArray[np.uint8], deadline: float | None = None) -> InferenceResult:
         """Submits a request and waits for its result.
 
-        If no batch is running, the caller runs the waiting one itself: waking another thread and being woken by it
-        takes longer. Raises ExpiredError if `deadline` passes before the run, and RuntimeError after `close`.
+        If no batch is running, the caller's thread runs the waiting requests itself, which is faster than waking
+        another thread and waiting for it. Raises ExpiredError if `deadline` passes before the run, and RuntimeError
+        after `close`.
         """
         with self._changed:
             request = self._add(model, inputs, deadline)
@@ -190,7 +191,7 @@ class Batcher:
         try:
             for request in batch.expired:
                 _fail(request, ExpiredError())
-            # A caller that went away canceled its request; once the run has begun it can't any more.
+            # Callers that went away have canceled their requests; after this line they can't.
             wanted = [request for request in batch.requests if request.future.set_running_or_notify_cancel()]
             if wanted:
                 self._run_requests(wanted, batch.still_waiting)
@@ -210,7 +211,7 @@ class Batcher:
             if len(requests) == 1:
                 requests[0].future.set_exception(error)
             else:
-                _log.warning("a batch of %d requests failed, each runs again alone: %s", len(requests), error)
+                _log.warning("a batch of %d requests failed; running each one separately: %s", len(requests), error)
                 for request in requests:
                     self._run_requests([request], still_waiting)
             return

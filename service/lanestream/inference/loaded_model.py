@@ -18,9 +18,9 @@ from lanestream.inference.model_info import ModelInfo
 class Placement:
     """Where a network really runs, and how.
 
-    `provider` is the execution provider and `reason` why it was taken; `nodes` counts the graph's nodes by what runs
-    them. `batch_sizes` are those that it runs, ascending; smaller batches are padded. `threads` are those of one run on
-    the CPU. `fell_back` is True if a better provider is installed and does not work.
+    `provider` is the execution provider and `reason` why it was selected; `nodes` counts the nodes of the graph by what
+    runs them. `batch_sizes` are the supported ones, ascending; other batches are padded to the next size. `threads` is
+    the number of CPU threads of one run. `fell_back` is True if a better provider is installed but does not work.
     """
 
     provider: str
@@ -34,14 +34,14 @@ class Placement:
 class LoadedModel(ABC):
     """A network that is ready to run. Threads may share it; it runs one batch at a time.
 
-    `sha256` is that of its file, in hexadecimal digits; empty if unknown.
+    `sha256` is the hash of its file in hexadecimal; empty if unknown.
     """
 
     def __init__(self, info: ModelInfo, placement: Placement) -> None:
         self.info = info
         self.placement = placement
         self.sha256 = ""
-        # A run takes all processors or the whole device: two at a time gain nothing, and need the memory of two.
+        # A run uses all processors or the whole device. Two at a time would not be faster but need twice the memory.
         self._running = threading.Lock()
 
     @property

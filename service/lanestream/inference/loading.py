@@ -16,8 +16,8 @@ def load_model(
 ) -> LoadedModel:
     """Loads the network in the file at `path`; `auto` takes the first provider that works and records what failed.
 
-    `installed` is what is installed here by default. Raises ModelError for a file that cannot be served, ProviderError
-    if a requested provider cannot be used: another one never replaces it silently.
+    `installed` defaults to what this machine has. Raises ModelError for a file that cannot be served, ProviderError if
+    a requested provider cannot be used: another one never replaces it silently.
     """
     installed = installed or Installed.here()
     failed: list[str] = []

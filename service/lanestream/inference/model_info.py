@@ -1,4 +1,4 @@
-"""What a model file says about itself: the one metadata entry that makes it servable."""
+"""The description in a model file: the metadata entry that serving needs."""
 
 from __future__ import annotations
 

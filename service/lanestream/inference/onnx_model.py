@@ -22,7 +22,7 @@ from lanestream.inference.providers import CPU, CUDA, DEFAULT_OPTIONS, ProviderS
 # On the CPU a batch of any size costs the same per input, so nothing is padded. Beyond 8 inputs nothing is gained, and
 # memory is lost: onnxruntime keeps what its largest batch needed.
 CPU_BATCH_SIZES: Final = tuple(range(1, 9))
-# A GPU gets few shapes, and all of them before the first frame: it searches for its algorithms at each new one.
+# A GPU searches for its algorithms at each new size, so it gets few sizes, all of them before the first frame.
 GPU_BATCH_SIZES: Final = (1, 2, 4, 8, 16, 32, 64)
 
 
@@ -111,7 +111,7 @@ def _cpu_session(path: Path, threads: int | None) -> Any:
 
 
 def _gpu_session(path: Path, spec: ProviderSpec, options: RuntimeOptions) -> Any:
-    # A fault of the file is reported as one before the device is used, and not as the device's.
+    # Loading on the CPU first reports an invalid file as such, not as a problem of the device.
     info = _info(_cpu_session(path, 1), path)
     preload_gpu_libraries()
     # What a provider cannot run goes to CUDA.
@@ -131,7 +131,7 @@ def _session_options(threads: int | None) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or processors()
     options.log_severity_level = 3
-    # Threads that spin while they wait take the processors from those that decode and search the next frame.
+    # Threads that spin while they wait take processor time from those that decode and search the next frame.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
     return options

@@ -37,7 +37,7 @@ def load(
     """
     require_file(path)
     openvino = import_openvino()
-    # Its reader of ONNX alone: the one that guesses the format complains about all others on stderr.
+    # Only the ONNX reader: the one that detects the format writes complaints about the others to stderr.
     reader = openvino.frontend.FrontEndManager().load_by_framework("onnx")
     try:
         read = reader.load(str(path))
@@ -80,7 +80,7 @@ def import_openvino() -> Any:
 
 @contextmanager
 def _without_telemetry() -> Iterator[None]:
-    """Hides the package by which OpenVINO reports every import to Google Analytics; it works without.
+    """Hides the package with which OpenVINO reports every import to Google Analytics; OpenVINO works without it.
 
     If OpenVINO was imported before, this changes nothing.
     """

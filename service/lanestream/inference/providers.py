@@ -1,7 +1,7 @@
-"""The table of execution providers: what can run a network, what has to be installed, and what `auto` takes.
+"""The table of execution providers: what can run a network, what must be installed, and what `auto` selects.
 
-Light: no runtime is imported before one is loaded. To add a provider of onnxruntime, add a row here and its package to
-an extra in pyproject.toml; another runtime needs a module with a `load` function besides.
+Importing it is cheap: a runtime is imported only when it is used. To add a provider of onnxruntime, add a row here and
+its package to an extra in pyproject.toml. Another runtime also needs a module with a `load` function.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ AUTO: Final = "auto"
 
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """How networks run: `threads` of one run on the CPU, if None one for each available processor.
+    """How networks run. `threads` is the number of CPU threads of one run; None: one for each available processor.
 
     `engine_cache` is the folder in which TensorRT keeps the engines it builds; None builds them at each start.
     """
@@ -41,7 +41,7 @@ DEFAULT_OPTIONS: Final = RuntimeOptions()
 class Installed:
     """What is installed here: onnxruntime's providers by its names for them, OpenVINO, and whether the CPU has AMX.
 
-    A provider that is built in does not have to work: only the loaded network shows that.
+    A provider that is installed may still not work: only loading a network shows that.
     """
 
     onnxruntime: frozenset[str]
@@ -66,10 +66,10 @@ class Installed:
 class ProviderSpec:
     """One execution provider.
 
-    `onnxruntime_name` is onnxruntime's name for it, empty for another runtime. `is_installed` and `auto_reason` look at
-    what is installed: the latter returns why `auto` takes the provider, or None if it does not. `missing` is the
-    message and the hint if it is not installed. `module` has a function `load(path, spec, options, reason)`. `options`
-    returns onnxruntime's options for the provider.
+    `onnxruntime_name` is onnxruntime's name for it, empty for another runtime. `auto_reason` returns why `auto` takes
+    the provider, given what is installed, or None if it does not. `missing` is the message and the hint if it is not
+    installed. `module` has a function `load(path, spec, options, reason)`. `options` returns onnxruntime's options for
+    the provider.
     """
 
     name: str
@@ -146,8 +146,8 @@ OPENVINO: Final = ProviderSpec(
     title="OpenVINO",
     is_installed=lambda installed: installed.openvino,
     missing=("OpenVINO is not installed", "pip install 'lanestream[openvino]', or use the provider auto or cpu"),
-    # It multiplies int8 matrices in AMX tiles and is up to half as fast again there; on a CPU without them onnxruntime
-    # is a little faster (`python tools/providers.py`).
+    # It multiplies int8 matrices in AMX tiles and is up to 1.5 times as fast there; without AMX onnxruntime is a little
+    # faster (`python tools/providers.py`).
     auto_reason=lambda installed: "OpenVINO is installed and faster on a CPU with AMX" if installed.amx else None,
     module="lanestream.inference.openvino_model",
 )
@@ -168,7 +168,7 @@ PROVIDER_NAMES: Final = (AUTO, *(spec.name for spec in PROVIDERS))
 
 
 def find_provider(name: str) -> ProviderSpec:
-    """Returns the provider of that name. Raises ProviderError if there is none."""
+    """Returns the provider of that name. Raises ProviderError for an unknown name."""
     for spec in PROVIDERS:
         if spec.name == name:
             return spec
@@ -184,6 +184,6 @@ def attempts(provider: str, installed: Installed) -> list[tuple[ProviderSpec, st
 
 
 def cuda_version() -> str | None:
-    """Returns the CUDA version that the installed onnxruntime was built for, None without one."""
+    """Returns the CUDA version that the installed onnxruntime was built for, or None for a CPU build."""
     version: str | None = import_module("onnxruntime").cuda_version or None
     return version

@@ -15,12 +15,12 @@ FloatMap = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class PatchGeometry:
-    """How a patch along a candidate is sampled: `size` x `size` network pixels, wide in proportion to the road's scale.
+    """How a patch along a candidate is sampled: `size` x `size` network pixels, with the road's scale in each row.
 
     At a row y a patch reaches `half_width` (y - horizon) to either side of its candidate, a constant width on a flat
-    road, and never less than `min_half_width` pixels of a working image. A candidate with the slope s has a patch wider
-    by hypot(1, `obliquity` s): with 1 patches are equally wide across their candidates, as errors are measured; with 0
-    they are equally wide on the ground.
+    road, and never less than `min_half_width` pixels of a working image. If the candidate has the slope s, its patch is
+    wider by hypot(1, `obliquity` s): with 1 all patches are equally wide across their candidates, as errors are
+    measured; with 0 they are equally wide on the ground.
     """
 
     size: int = 112
@@ -50,8 +50,8 @@ class RoadCropGeometry:
     """The crop of the whole road: `size` x `size` network pixels in which the horizon always has the same row.
 
     Its rows run from `above` of the depth over the horizon down to the bottom of the image. Its columns reach half the
-    image's width to either side of the middle at the bottom and `narrowest` of that at the horizon, which enlarges what
-    is far away. Images are reduced to `detail_width` before they are warped, so that near rows do not alias.
+    image's width to either side of the middle at the bottom and `narrowest` of that at the horizon, which magnifies
+    distant road. Images are reduced to `detail_width` before they are warped, so that near rows do not alias.
     """
 
     size: int = 224

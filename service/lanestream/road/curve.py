@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Three rows determine a curve. As fractions of the distance from the horizon to the bottom row they spread over the
-# part of the road that an image resolves.
+# Three rows determine a curve. These fractions of the distance from the horizon to the bottom row cover the part of the
+# road that an image resolves.
 ANCHORS: Final[FloatArray] = np.array([1.0, 0.45, 0.15])
 
 

@@ -28,7 +28,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class LaneBoundary:
-    """A tracked boundary: a detection with an identity, a history and a position beside the camera.
+    """A tracked boundary: a detection with an identity, a history and a position relative to the camera.
 
     `position` is -1 for ego left, +1 for ego right, -2 and +2 for the next ones out. `age_s` counts from its first
     detection. `state` is `detected` if a detection of this frame supports it, `predicted` if the filter carries it.

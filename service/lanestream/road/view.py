@@ -23,8 +23,8 @@ WORKING_WIDTH: Final = 640
 # Nearer to the horizon than this fraction of the road's rows a lane is a few pixels wide, and all lines look alike.
 FARTHEST_VISIBLE: Final = 0.1
 
-# Lanes are 2.5 to 4.5 m wide and cameras 1 to 2.4 m high. In columns per row offset, which are meters over the camera's
-# height, a lane is usually this wide and within these limits.
+# Lanes are 2.5 to 4.5 m wide and cameras 1 to 2.4 m high. These are the usual width and its limits in columns per row
+# offset, which equal meters over the camera's height.
 USUAL_LANE_WIDTH: Final = 2.4
 LANE_WIDTHS: Final = (1.1, 4.5)
 
@@ -70,7 +70,7 @@ class Scaling:
 
 @dataclass(frozen=True)
 class RoadView:
-    """The part of an image that can be road: all below the horizon. Sizes and rows in pixels of that image."""
+    """The part of an image that can be road: everything below the horizon. Sizes and rows are in its pixels."""
 
     width: int
     height: int
@@ -88,7 +88,7 @@ class RoadView:
 
     @property
     def middle(self) -> float:
-        """The middle column, above which a camera in the middle of its lane stands."""
+        """The middle column, where a camera in the middle of its lane is."""
         return (self.width - 1) / 2.0
 
     def row_at(self, share: float) -> float:
@@ -125,7 +125,7 @@ def visible_spans(curves: Curves, view: RoadView, top_share: float = FARTHEST_VI
     left = ~inside & (first[:, None] < _INDICES)
     last = np.where(left.any(axis=1), left.argmax(axis=1), len(rows)) - 1
     top, bottom = rows[last], rows[first]
-    # The span of a curve that is nowhere inside is its first row alone.
+    # A curve that is entirely outside has the span of its first row only.
     return Spans(top, bottom, bottom - top >= 2.0)
 
 

@@ -1,4 +1,4 @@
-"""Association: which detection belongs to which track, gated, and in order from left to right."""
+"""Association: matches detections to tracks within a gate, in order from left to right."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def associate(tracks: Sequence[Track], columns: FloatArray, noise: FloatArray) -
 
     The cost of a pair is the innovation's negative log likelihood d^2 + ln det S; pairs outside the gate are
     impossible. Boundaries do not cross at the bottom row, so tracks and detections are matched in order from left to
-    right: the most pairs that keep the order, and of those the cheapest. That is an alignment of two sequences, found
-    by dynamic programming (S. Needleman and C. Wunsch, 1970).
+    right: as many pairs as possible, at the lowest total cost. This is an alignment of two sequences, found by dynamic
+    programming (S. Needleman and C. Wunsch, 1970).
     """
     if not tracks or not len(columns):
         return []
@@ -39,7 +39,7 @@ def associate(tracks: Sequence[Track], columns: FloatArray, noise: FloatArray) -
 
 
 def _cheapest_alignment(costs: list[list[float]]) -> list[tuple[int, int]]:
-    """Returns the pairs (row, column), both ascending, of the most finite costs, and of those with the lowest sum."""
+    """Returns as many ascending pairs (row, column) of finite cost as possible, with the lowest sum of costs."""
     rows, columns = len(costs), len(costs[0])
     # best[i][j] is (-number of pairs, sum of costs) of the first i rows and j columns.
     best = [[(0, 0.0)] * (columns + 1) for _ in range(rows + 1)]
@@ -65,12 +65,12 @@ def _cheapest_alignment(costs: list[list[float]]) -> list[tuple[int, int]]:
 def recover(
     tracks: Sequence[Track], columns: FloatArray, pairs: Sequence[tuple[int, int]], reach: FloatArray
 ) -> list[tuple[int, int]]:
-    """Returns further (track, detection) pairs: confirmed tracks without one, with detections within `reach` (3,).
+    """Returns further (track, detection) pairs: unmatched confirmed tracks with detections within `reach` (3,).
 
-    A road that turns faster than the filter expects takes its detections out of the track's gate. If they are still
-    nearest to that track in the second frame, they are the same boundary and the filter was wrong; a single one outside
-    the gate is an error. Distances count at the two near rows; the nearest pairs come first. Detections of tentative
-    tracks are available: those tracks began when the detection left the gate.
+    If a road turns faster than the filter expects, its detections leave the gate. If they are still nearest to the same
+    track in the second frame, they belong to it and the filter was wrong; a single one outside the gate is an error.
+    Distances count at the two near rows; the nearest pairs come first. Detections of tentative tracks are available:
+    those tracks began when the detection left the gate.
     """
     confirmed = [(i, j) for i, j in pairs if tracks[i].confirmed]
     near = []

@@ -1,4 +1,4 @@
-"""The ego lane: its width, the positions of boundaries beside the camera, and when the camera crosses one."""
+"""The ego lane: its width, the positions of boundaries relative to the camera, and lane changes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lanestream.tracking.tracks import Track
 
 # How quickly the lane width follows that of a frame.
 _WIDTH_GAIN: Final = 0.05
-# A boundary has changed sides if it was this many lane widths on the other side of the camera for so many frames.
+# A boundary has changed sides after this many frames at least this many lane widths beyond the camera.
 _CROSSING_MARGIN: Final = 0.1
 _CROSSING_FRAMES: Final = 3
 # A gap of more lane widths than this counts as two lanes. The camera may be anywhere in its lane, so the first boundary
@@ -21,7 +21,7 @@ _NEXT_GAP: Final = 1.6
 
 
 def learned_width(width: float, measured: float) -> float:
-    """Returns the lane width after a frame's `measured` one, both in row offsets; one that no lane has is ignored."""
+    """Returns the updated lane width, in row offsets; a `measured` width outside the limits of lanes is ignored."""
     narrowest, widest = LANE_WIDTHS
     return width + _WIDTH_GAIN * (measured - width) if narrowest <= measured <= widest else width
 

@@ -1,6 +1,6 @@
 """The Kalman filter of boundaries: their columns at three fixed rows, and the velocities of these columns.
 
-Three rows determine the curve x(y) = v + b u + k / u; of a straight boundary the three columns are collinear. The model
+Three rows determine the curve x(y) = v + b u + k / u; if it is straight, the three columns are collinear. The model
 is nearly constant velocity with the frames' own time steps (Y. Bar-Shalom et al., "Estimation with applications to
 tracking and navigation", 2001, section 6.2), with a velocity that decays as in section 8.2.3, so no boundary keeps
 drifting without detections. The update is in Joseph form (section 5.2.2). All functions take a batch of boundaries.
@@ -21,7 +21,7 @@ from lanestream.road.view import RoadView
 MEASURED: Final = 3
 STATE: Final = 6
 
-# Seconds in which a velocity without detections decays to a third.
+# Time constant of the velocity's decay in seconds.
 _DECAY_S: Final = 0.4
 
 
@@ -51,7 +51,7 @@ class TrackedRows:
         return np.asarray(self._to_coefficients @ covariances @ self._to_coefficients.T)
 
     def measure(self, curve: Curve, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns columns (3,) and their covariance (3, 3) from a detected curve and that of its coefficients."""
+        """Returns the columns (3,) of a detected curve and their covariance (3, 3), from that of its coefficients."""
         basis = curve_basis(curve.horizon, self.y)
         return basis @ curve.coefficients, np.asarray(basis @ covariance @ basis.T)
 

@@ -1,4 +1,4 @@
-"""The state of a tracker as a small value of plain types: saved in one process, it continues exactly in another."""
+"""The state of a tracker as a small value of plain types: it can be saved, and restored exactly in another process."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class TrackSnapshot:
         )
 
     def track(self, memory: int) -> Track:
-        """Returns the track, which remembers the hits of `memory` frames. Raises ValueError for half a filter."""
+        """Returns the track, which keeps the hits of `memory` frames. Raises ValueError for an incomplete filter."""
         numbers = np.frombuffer(b64decode(self.filter, validate=True), _NUMBERS).astype(float)
         return Track(
             numbers[:STATE].copy(),

@@ -17,23 +17,23 @@ from lanestream.tracking.kalman import MEASURED, TrackedRows, initial_state, pre
 from lanestream.tracking.state import TrackerState, TrackSnapshot
 from lanestream.tracking.tracks import Track
 
-# Lengths are shares of the depth of the road view. Boundaries are tracked at these rows; there they accelerate by about
-# this per second squared and begin with up to this speed per second.
+# Lengths are shares of the depth of the road view. Boundaries are tracked at these rows, with this acceleration noise
+# (per second squared) and this sigma of the initial velocity (per second).
 _ROWS: Final[FloatArray] = np.array([1.0, 0.5, 0.2])
 _ACCELERATION: Final[FloatArray] = np.array([2.5, 1.6, 1.0])
 _SPEED: Final[FloatArray] = np.array([1.0, 0.5, 0.3])
-# A detection's own covariance is widened by the first, and by a horizon that moves by the second as the camera pitches.
+# Noise that is added to a detection's covariance: of its columns, and of the horizon's row as the camera pitches.
 _NOISE: Final = 0.05
 _PITCH: Final = 0.006
-# A track is confirmed by so many hits in so many frames, and coasts for so many seconds without any.
+# A track is confirmed by this many hits within this many frames, and coasts for this many seconds without any.
 _HITS: Final = 3
 _FRAMES: Final = 5
 _COAST_S: Final = 0.7
-# Where the road turns or the camera pitches, the position of a coasting boundary is unknown: it is reported until the
-# columns that it was moved by at the near and the middle row, each over its row offset, differ by this in all.
+# If the road turns or the camera pitches, the position of a coasting boundary is uncertain. It is reported until its
+# shifts at the near and the middle row, each over its row offset, have diverged by this in total.
 _MOST_DRIFT: Final = 0.15
-# In lane widths: a track that its detection leaves behind by less than the first starts again there, and tracks of one
-# marking, nearer than the second, become one.
+# In lane widths: a track restarts at a detection outside its gate that is closer than the first, and tracks closer than
+# the second follow one marking and are merged.
 _RECOVER: Final = 0.3
 _MERGE: Final = 0.35
 # The rows are chosen again if the horizon has moved by this much.
@@ -43,8 +43,8 @@ _HORIZON_MOVED: Final = 0.02
 class LaneTracker:
     """Tracks the boundaries of one camera, one Kalman filter each.
 
-    In the first frames of a camera there is nothing to compare with, so tentative tracks are reported too: a single
-    image gets its lanes, and a stream has lanes from its first frame on.
+    In the first frames of a camera tentative tracks are reported too, so that a single image has lanes and a stream has
+    them from its first frame on.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,8 @@ class LaneTracker:
     def restored(cls, state: TrackerState, ids_lost: int = 0) -> LaneTracker:
         """Returns a tracker that continues where `state` was taken.
 
-        `ids_lost` more ids count as assigned: by the tracker that continued after `state` was taken, and was lost.
+        `ids_lost` more ids count as assigned, because a tracker that continued after `state` was taken and is now lost
+        may have assigned them.
         Raises ValueError for an invalid state.
         """
         tracker = cls()
@@ -120,7 +121,7 @@ class LaneTracker:
         return seconds
 
     def _rows_for(self, view: RoadView) -> TrackedRows:
-        """Returns the tracked rows; chosen again if the horizon has moved too far from theirs."""
+        """Returns the tracked rows, chosen again if the horizon has moved too far."""
         if self._rows is None or abs(self._rows.horizon - view.horizon) > _HORIZON_MOVED * view.depth:
             rows = TrackedRows.of(view, _ROWS)
             for track in self._tracks:
@@ -137,7 +138,7 @@ class LaneTracker:
             track.previous_columns = track.columns
         if not self._tracks:
             return
-        # After the coasting time a track is deleted anyway, and a long step would only overflow.
+        # A track is deleted after the coasting time anyway; a longer step could overflow.
         states, covariances = predict(
             np.stack([track.state for track in self._tracks]),
             np.stack([track.covariance for track in self._tracks]),
@@ -148,7 +149,7 @@ class LaneTracker:
             track.state, track.covariance = state, covariance
 
     def _delete_old(self) -> None:
-        """Deletes tracks that a gap in the stream has made too old; with none left, the stream begins again."""
+        """Deletes tracks that are too old after a gap in the stream; if none is left, the stream counts as new."""
         self._tracks = [track for track in self._tracks if self._clock - track.last_hit <= _COAST_S]
         if not self._tracks:
             self._frames = 0
@@ -158,7 +159,7 @@ class LaneTracker:
     ) -> tuple[FloatArray, FloatArray]:
         """Returns the columns (M, 3) of detections and their covariances (M, 3, 3).
 
-        A covariance is that of the fit, of the detector, and of the pitch, which moves all rows.
+        A covariance is the sum of those of the fit, of the detector's noise and of the pitch, which moves all rows.
         """
         columns, noise = np.empty((len(detections), MEASURED)), np.empty((len(detections), MEASURED, MEASURED))
         for j, detection in enumerate(detections):
@@ -176,7 +177,7 @@ class LaneTracker:
         noise: FloatArray,
         view: RoadView,
     ) -> None:
-        """Updates tracks with their detections, moves those without, and begins a track for each other detection."""
+        """Updates matched tracks, moves unmatched ones, and begins a track for each unmatched detection."""
         tracks = self._tracks
         if pairs:
             mine, theirs = np.array(pairs).T
@@ -205,7 +206,7 @@ class LaneTracker:
         ]
 
     def _coast(self, matched: set[int], view: RoadView) -> None:
-        """Moves unmatched tracks as the matched ones have moved: that was the camera's motion, not the road's."""
+        """Moves unmatched tracks by the median motion of matched ones, which is the camera's motion."""
         seen = [
             track.columns - track.previous_columns
             for i, track in enumerate(self._tracks)
@@ -244,7 +245,7 @@ class LaneTracker:
         return float(np.sqrt(track.covariance[0, 0])) <= _MERGE * self._lane_width * view.depth
 
     def _merged(self, tracks: list[Track], view: RoadView) -> list[Track]:
-        """Returns the tracks, of those that have converged only the oldest, which keeps its identity."""
+        """Returns the tracks without those that have converged on an older one, which keeps its identity."""
         kept: list[Track] = []
         limit = self._in_lane_widths(_MERGE, view)
         for track in sorted(tracks, key=lambda each: (not each.confirmed, each.born, each.track_id or 0)):
@@ -283,7 +284,7 @@ class LaneTracker:
         return FrameResult(tuple(lanes), self._ego_lane(tracks, columns, positions, view), view.horizon, events)
 
     def _fading(self, track: Track) -> float:
-        """Returns the factor of a track's probability: without detections it is less and less likely to be there."""
+        """Returns the factor of a track's probability, which falls with the time since its last detection."""
         return 1.0 - 0.5 * min(1.0, (self._clock - track.last_hit) / _COAST_S)
 
     def _ego_lane(

@@ -14,9 +14,9 @@ from lanestream.tracking.kalman import MEASURED, TrackedRows
 class Track:
     """A tracked boundary. Times are seconds on the tracker's own clock.
 
-    `state` (6,) and `covariance` (6, 6) are the filter's. `hits` remembers for the last frames whether a detection
-    supported it. `side` is -1 left and +1 right of the camera; `crossing` counts the frames in which it has been
-    clearly on the other one. `drift` is how much the road has turned under it since it was last detected.
+    `state` (6,) and `covariance` (6, 6) are the filter's. `hits` records for the last frames whether a detection
+    supported it. `side` is -1 left and +1 right of the camera; `crossing` counts consecutive frames in which it was
+    clearly on the other side. `drift` is how much the road has turned since it was last detected.
     `previous_columns` are those of the last frame.
     """
 
@@ -45,7 +45,7 @@ class Track:
 
     @property
     def detected_twice(self) -> bool:
-        """Whether detections supported it in this frame and in the last one, so that it moved as its boundary did."""
+        """Whether detections supported it in this frame and in the last one, so that its motion was measured."""
         return len(self.hits) > 1 and self.hits[-1] and self.hits[-2]
 
     @property
@@ -54,7 +54,7 @@ class Track:
         return self.state[:MEASURED]
 
     def hit(self, detection: Detection, now: float) -> None:
-        """Records a detection, with which the filter was updated."""
+        """Records the detection that the filter was updated with."""
         self.hits.append(True)
         self.detected = True
         self.drift = 0.0

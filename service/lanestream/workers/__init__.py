@@ -1,1 +1,1 @@
-"""Where frames are worked on: threads or processes, and who may work now."""
+"""Processing of frames in threads or worker processes, and admission to them."""

@@ -1,4 +1,4 @@
-"""Admission: which frame is processed next if there are more than the workers can take."""
+"""Admission: which frame is processed next if there are more frames than slots."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class _Waiter:
 class FairSemaphore:
     """Admits frames to `slots`, first come, first served; at most `latest_slots` of them for frames of mode `latest`.
 
-    A frame of mode `latest` that has to leave the slots to others keeps its place in the queue: if cameras of both
-    modes wait, none waits for longer than the others' frames take. Belongs to one event loop.
+    A frame of mode `latest` that may not take a free slot keeps its position in the queue, so cameras of neither mode
+    can starve the others. Belongs to one event loop.
     """
 
     def __init__(self, slots: int, latest_slots: int) -> None:
@@ -46,7 +46,7 @@ class FairSemaphore:
             self._release(waiter)
 
     def _admit(self) -> None:
-        """Gives the free slots to those who have waited longest and may have them."""
+        """Gives the free slots to the frames that have waited longest, within the limit for mode `latest`."""
         for waiter in tuple(self._queue):
             if not self._slots:
                 return

@@ -33,7 +33,7 @@ class ModelSummary:
 
 @dataclass(frozen=True)
 class DetectorInfo:
-    """A detector by the name that users ask for, and the model that it cannot do without."""
+    """A detector: the name by which users request it, and the model that it requires."""
 
     detector: str
     model: ModelSummary
@@ -51,7 +51,7 @@ class Capabilities:
         return cls(tuple(DetectorInfo(name, ModelSummary.of(engine.main_model(name))) for name in engine.detectors))
 
     def select(self, name: str | None = None) -> DetectorInfo:
-        """Returns the detector of that name, by default the first one. Raises NoDetectorError if it is missing."""
+        """Returns the detector `name`, by default the first one. Raises NoDetectorError if it is not loaded."""
         for info in self.detectors:
             if name in (None, info.detector):
                 return info

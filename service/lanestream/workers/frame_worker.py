@@ -1,4 +1,4 @@
-"""Processes one frame from the image file to its lanes, in the thread that calls."""
+"""Processes a frame from the image file to its lanes, in the calling thread."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class EncodedFrame:
     """An image file, when it was captured (the client's seconds) and when it arrived (monotonic seconds).
 
-    After `deadline` (monotonic seconds) nobody needs its lanes; None: they are always needed.
+    After `deadline` (monotonic seconds) its lanes are no longer needed; None means no deadline.
     """
 
     data: bytes
@@ -36,7 +36,7 @@ class EncodedFrame:
 
 
 class FrameWorker:
-    """Processes frames, each in the thread that calls; their inference requests meet in one batcher.
+    """Processes frames, each in the calling thread; all inference requests go to one batcher.
 
     `models` are the models by their roles. `observe`, if given, gets the report of every batch.
     """
@@ -52,7 +52,7 @@ class FrameWorker:
         self._batcher = Batcher(observe)
 
     def process(self, session: Session, frame: EncodedFrame) -> ProcessedFrame:
-        """Returns the lanes of `frame`; the frames of one session come one at a time.
+        """Returns the lanes of `frame`. Frames of one session must be processed one at a time.
 
         Raises ImageError if the file is refused, ExpiredError if its deadline passes before the networks run; the
         session then stays as it was.
@@ -68,7 +68,7 @@ class FrameWorker:
             nonlocal infer_s
             since = time.monotonic()
             result = self._batcher.run(self._models[role], inputs, frame.deadline)
-            # Waiting for batches of others counts as queueing.
+            # Waiting for other batches counts as queueing.
             infer_s += result.ended - max(result.started, since)
             return result.outputs
 
@@ -79,5 +79,5 @@ class FrameWorker:
         return ProcessedFrame.of(picture, result, timing)
 
     def close(self) -> None:
-        """Ends the batcher's thread after its present work."""
+        """Ends the batcher's thread after the waiting requests have run."""
         self._batcher.close()

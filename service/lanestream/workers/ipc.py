@@ -1,7 +1,7 @@
-"""Messages between a service and its worker processes: Python's own values, each after its length.
+"""Messages between a service and its worker processes: pickled Python objects with a length prefix.
 
-Both ends are the same program on the same machine, joined by a socket that nobody else can reach; data from outside is
-never read as such a message.
+Both ends are the same program on the same machine, connected by a socket that no other process can reach. Data from
+clients is never unpickled.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class FrameJob:
 
 @dataclass(frozen=True)
 class FrameDone:
-    """The outcome of a job: lanes and the session's new state, or an error; and the batches that ran meanwhile."""
+    """The outcome of a job: lanes and the session's new state, or an error; and reports of recent batches."""
 
     number: int
     outcome: FrameOutcome
@@ -58,7 +58,7 @@ class FrameDone:
 
 
 def encode_message(value: object) -> bytes:
-    """Returns `value` as it is sent."""
+    """Returns `value` as bytes to send."""
     body = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
     return _LENGTH.pack(len(body)) + body
 

@@ -1,4 +1,4 @@
-"""The interface of worker pools, which process frames so that the event loop never decodes, detects or tracks."""
+"""The interface of worker pools, which keep decoding, detection and tracking off the event loop."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ class SessionHandle(Protocol):
 
     @property
     def state(self) -> SessionState:
-        """Everything it remembers. Do not read it while a frame of the session is being processed."""
+        """The complete state. Do not read it while a frame of the session is being processed."""
 
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
         """Continues where `state` was taken, see `Session.restore`. Raises ValueError for an invalid state."""
 
 
 class WorkerPool(ABC):
-    """Processes encoded frames; the frames of one session one at a time, those of different ones in parallel.
+    """Processes encoded frames: those of one session one at a time, those of different sessions in parallel.
 
-    Frames wait for admission before anything is spent on them, so however many there are, a frame that was begun is
-    soon done. `workers` processes have `threads_each`; `own_threads` of this process are for other work.
+    Frames wait for admission before any work on them, so under any load a frame that has started is finished soon.
+    There are `workers` processes with `threads_each`; `own_threads` threads of this process do other work.
     """
 
     def __init__(self, capabilities: Capabilities, workers: int, threads_each: int, own_threads: int) -> None:
         self.capabilities = capabilities
-        # One frame more than its threads is handed to each process in advance, so that a thread that is done continues
-        # without waiting for the event loop. Frames of mode `latest` leave two of many threads idle: the last bit of
-        # throughput would cost them more time than it is worth.
+        # Each process gets one frame more than it has threads, so that a thread that becomes free continues without
+        # waiting for the event loop. Frames of mode `latest` leave two of many threads idle: for them, latency matters
+        # more than the last bit of throughput.
         self._admission = FairSemaphore(workers * (threads_each + 1), workers * max(1, threads_each - 2))
         self._threads = ThreadPoolExecutor(own_threads, thread_name_prefix="lanestream-frames")
 
@@ -58,7 +58,7 @@ class WorkerPool(ABC):
         return ()
 
     def admit(self, *, latest: bool = False) -> AbstractAsyncContextManager[None]:
-        """Returns a context that waits for a slot and holds it, first come, first served; needed for `run`."""
+        """Returns a context that waits for a slot, first come, first served, and holds it. `run` requires it."""
         return self._admission.slot(latest=latest)
 
     @abstractmethod
@@ -73,13 +73,13 @@ class WorkerPool(ABC):
         """Returns the lanes of `frame`; `session` is from `open_session`.
 
         Raises ImageError if the file is refused, ExpiredError if its deadline passes before the networks run,
-        WorkerLostError if the process that had it has ended; the session then stays as it was.
+        WorkerLostError if the worker process ends. In these cases the session stays as it was.
         """
 
     async def in_thread(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Returns what `function` returns in a thread of this process."""
+        """Runs `function` in a thread of this process and returns its result."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, lambda: function(*args, **kwargs))
 
     async def close(self) -> None:
-        """Ends threads and processes after their present work."""
+        """Ends threads and processes after their current work."""
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)

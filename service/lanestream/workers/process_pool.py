@@ -1,4 +1,4 @@
-"""Frames in worker processes: Python runs one thread of a process at a time, and much of finding lanes is Python."""
+"""Worker processes: Python runs one thread of a process at a time, and much of the work on a frame is Python."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _PROGRAM: Final = "lanestream.workers.worker_main"
-# Each process has networks of its own, so more of them only on request.
+# Each process has its own networks, so more processes are started only on request.
 _MOST_PROCESSES: Final = 8
 # The memory that a worker and the service itself may need for frames of any accepted size.
 _WORKER_BYTES: Final = 400e6
@@ -38,9 +38,9 @@ _SERVICE_BYTES: Final = 300e6
 _RESTART_S: Final = 0.5
 _LONGEST_RESTART_S: Final = 30.0
 _END_S: Final = 10.0
-# A frame takes a worker a fraction of a second, many seconds on a busy machine; a worker that takes longer hangs.
+# A frame takes a fraction of a second, or many seconds on a busy machine; a worker that takes longer than this hangs.
 _FRAME_S: Final = 30.0
-# That time is waited for in parts: a service that was suspended finds one part over when it continues, not all.
+# The time limit is waited for in parts: after the service was suspended, only one part has passed, not all.
 _PARTS: Final = 10
 
 
@@ -73,7 +73,7 @@ class Worker:
     async def start(cls, setup: WorkerSetup) -> Worker:
         """Returns a worker with a warm engine.
 
-        Raises what `setup.load` raises, and WorkerLostError if the process ends before it is ready.
+        Raises the errors of `setup.load`, and WorkerLostError if the process ends before it is ready.
         """
         mine, theirs = socket.socketpair()
         with theirs:
@@ -103,19 +103,19 @@ class Worker:
 
     @property
     def pending(self) -> int:
-        """How many frames it has."""
+        """The number of its unfinished frames."""
         return len(self._jobs)
 
     def begin(self, threads: int) -> None:
-        """Lets it take frames, in so many threads."""
+        """Starts processing frames, in this number of threads."""
         self._writer.write(encode_message(threads))
         self._listening = asyncio.create_task(self._listen())
 
     async def process(self, session: RemoteSession, frame: EncodedFrame, limit_s: float) -> FrameDone:
         """Returns the outcome of a frame.
 
-        Raises WorkerLostError if the worker ends before, TimeoutError if the frame takes `limit_s` seconds. Time in
-        which the service itself was suspended, with its container for example, hardly counts: so was the worker.
+        Raises WorkerLostError if the worker ends first, TimeoutError if the frame takes `limit_s` seconds. Time during
+        which the service was suspended, for example with its container, hardly counts: so was the worker.
         """
         number = next(self._numbers)
         done: asyncio.Future[FrameDone] = asyncio.get_running_loop().create_future()
@@ -132,14 +132,14 @@ class Worker:
             del self._jobs[number]
 
     async def wait_ended(self) -> int:
-        """Waits for its end, after which all its frames are lost; returns the exit status."""
+        """Waits until the process ends, which loses its frames, and returns the exit status."""
         assert self._listening is not None  # noqa: S101 - begun by the pool
         await self._listening
         self._writer.close()
         return await self._process.wait()
 
     async def close(self) -> None:
-        """Ends it after its present work."""
+        """Ends the process after its current work."""
         self._writer.close()
         with suppress(TimeoutError):
             async with asyncio.timeout(_END_S):
@@ -147,7 +147,7 @@ class Worker:
         await self.kill()
 
     async def kill(self) -> None:
-        """Ends it immediately."""
+        """Kills the process."""
         self._writer.close()
         with suppress(ProcessLookupError):
             self._process.kill()
@@ -182,9 +182,9 @@ class Worker:
 
 
 class ProcessPool(WorkerPool):
-    """Hands each frame, with its session's state, to the worker process that has the fewest.
+    """Sends each frame, with the state of its session, to the worker process that has the fewest frames.
 
-    Workers that end are replaced, and one that takes `frame_s` seconds for a frame is ended. `observe`, if given, gets
+    Workers that end are replaced, and one that takes `frame_s` seconds for a frame is killed. `observe`, if given, gets
     the report of every batch that their networks run.
     """
 
@@ -215,11 +215,11 @@ class ProcessPool(WorkerPool):
         observe: Callable[[BatchReport], None] | None = None,
         frame_s: float = _FRAME_S,
     ) -> ProcessPool:
-        """Returns a pool with warm workers: `threads_of` returns the threads of each of so many `processes`, default 1.
+        """Returns a pool with warm workers. `threads_of(processes)` is the number of threads of each; default 1.
 
-        By default networks on the CPU get a process for each processor, up to 8 and to what a container's memory has
-        room for; those on a device get one for all, in which the requests of all cameras meet. Raises what `setup.load`
-        raises.
+        By default networks on the CPU get one process per processor, at most 8 and as many as fit into a container's
+        memory. Networks on a GPU get one process, in which the requests of all cameras meet. Raises the errors of
+        `setup.load`.
         """
         workers = [await Worker.start(setup)]
         try:
@@ -261,7 +261,7 @@ class ProcessPool(WorkerPool):
         try:
             done = await worker.process(session, frame, self._frame_s)
         except TimeoutError:
-            _log.error("a worker process took more than %g s for a frame; it is ended", self._frame_s)
+            _log.error("a worker process took more than %g s for a frame and is killed", self._frame_s)
             await worker.kill()
             raise _lost() from None
         if self._observe is not None:
@@ -273,7 +273,7 @@ class ProcessPool(WorkerPool):
         return processed
 
     async def close(self) -> None:
-        """Ends the workers after their present work."""
+        """Ends the workers after their current work."""
         for supervisor in self._supervisors:
             supervisor.cancel()
         await asyncio.wait(self._supervisors)
@@ -281,11 +281,11 @@ class ProcessPool(WorkerPool):
         await super().close()
 
     async def _supervise(self, worker: Worker) -> None:
-        """Replaces a worker that has ended, again and again."""
+        """Replaces a worker each time it ends."""
         while True:
             status = await worker.wait_ended()
             self._workers.remove(worker)
-            _log.error("a worker process ended with status %d; another one is started", status)
+            _log.error("a worker process ended with status %d and is replaced", status)
             worker = await self._restart()
             worker.begin(self._threads_each)
             self._workers.append(worker)
@@ -306,7 +306,7 @@ async def _add(workers: list[Worker], setup: WorkerSetup) -> None:
 
 
 def default_processes(capabilities: Capabilities) -> int:
-    """Returns how many processes work on frames by default."""
+    """Returns the default number of worker processes."""
     on_gpu = {spec.name for spec in PROVIDERS if spec.on_gpu}
     if any(info.model.provider in on_gpu for info in capabilities.detectors):
         return 1

@@ -1,4 +1,4 @@
-"""Frames in threads of the service's own process."""
+"""Processes frames in threads of the service's own process."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 class ThreadPool(WorkerPool):
-    """Each frame has one thread of a small pool; the inference requests of all sessions meet in one batcher.
+    """Each frame has one thread of a small pool; the inference requests of all sessions go to one batcher.
 
-    So one thread works on a frame while a network runs another frame, on one device for all.
+    So one thread processes a frame while a network runs on the frames of others.
     """
 
     def __init__(
@@ -45,6 +45,6 @@ class ThreadPool(WorkerPool):
         return await self.in_thread(self._worker.process, session, frame)
 
     async def close(self) -> None:
-        """Ends the threads after their present work."""
+        """Ends the threads after their current work."""
         await super().close()
         await asyncio.to_thread(self._worker.close)

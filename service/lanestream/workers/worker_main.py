@@ -1,7 +1,7 @@
 """The program of a worker process: frames in, lanes out, over the socket that the service started it with.
 
-It holds the networks and nothing else: the session's state comes with each frame and goes back with its lanes. Hence
-any worker can take any frame, and one that ends loses only the frames that it was processing.
+It holds only the networks: the state of the session comes with each frame and goes back with its lanes. So any worker
+can take any frame, and one that ends loses only the frames that it was processing.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class WorkerProcess:
         self._sending = threading.Lock()
 
     def serve(self) -> None:
-        """Sends its capabilities, receives the number of threads, and works until the service closes the socket."""
+        """Sends its capabilities, receives the number of threads, and processes frames until the socket is closed."""
         self._send(Capabilities.of(self._engine))
         with suppress(EOFError, ConnectionError), ThreadPoolExecutor(receive_message(self._channel)) as threads:
             while True:
@@ -67,7 +67,7 @@ class WorkerProcess:
 
 
 def portable(error: Exception) -> Exception:
-    """Returns an error that another process can read: ours as it is, any other by its name, with its traceback."""
+    """Returns an error that can be pickled: a LanestreamError unchanged, any other as text with its traceback."""
     if isinstance(error, LanestreamError):
         return error
     readable = RuntimeError(f"{type(error).__name__}: {one_line(error)}")
@@ -76,7 +76,7 @@ def portable(error: Exception) -> Exception:
 
 
 def main(descriptor: int) -> None:
-    """Works for the service at the other end of the socket `descriptor`."""
+    """Processes frames for the service at the other end of the socket `descriptor`."""
     # The service handles signals for the whole process group: it drains, and closes the socket when it is done.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
