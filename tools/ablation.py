@@ -23,7 +23,7 @@ import click
 import cv2
 import numpy as np
 
-from lanestream.detection import candidate_detector, curve_fit, ego_prior, proposals, vanishing_point
+from lanestream.detection import candidate_detector, curve_fit, proposals, vanishing_point
 from lanestream.detection.ego_prior import EgoPrior, LaneSpacing
 from lanestream.engine import Engine, load_engine
 from lanestream.errors import LanestreamError
@@ -110,9 +110,6 @@ def _without_own_boundaries(engine: Engine, stack: ExitStack) -> Engine:
 STAGES: Final[dict[str, Leave | None]] = {
     BASELINE: None,
     "ego-lane prior": _without_regressor,
-    "mirrored crop of an uncertain regressor": _replace(ego_prior, "_UNCERTAIN", np.inf),
-    "refined vanishing point": _replace(proposals, "refine", lambda guess, *_: guess),
-    "curvature of the road": _replace(proposals, "NEAR_PRIOR", replace(vanishing_point.NEAR_PRIOR, curvature=1e-9)),
     "lines through the vanishing point": _replace(proposals, "find_lines", _without_lines),
     "tracked boundaries as candidates": _propose(tracked=None),
     "prior's boundaries as candidates": _without_own_boundaries,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lanestream.detection.interface import Detections, Detector, FrameContext, Infer, ModelRole
 from lanestream.images.resizing import working_image
 from lanestream.road.results import FrameResult
-from lanestream.road.view import Image
+from lanestream.road.view import Image, Scaling
 from lanestream.tracking.state import TrackerState
 from lanestream.tracking.tracker import LaneTracker
 
@@ -76,7 +76,7 @@ class Session:
         started = time.perf_counter()
         working, scaling = working_image(image)
         inference = _TimedInference(infer)
-        detections = self._detector.detect(working, self._context(working), inference)
+        detections = self._detector.detect(working, self._context(image, working, scaling), inference)
         detected = time.perf_counter()
         self._update_horizon(detections)
         result = self._tracker.update(detections.boundaries, timestamp, detections.view).to_image(scaling)
@@ -87,12 +87,14 @@ class Session:
         )
         return result
 
-    def _context(self, working: Image) -> FrameContext:
+    def _context(self, image: Image, working: Image, scaling: Scaling) -> FrameContext:
         height, width = working.shape[:2]
         is_known = self._size == (width, height)
-        horizon = self._horizon if self._configured is None else self._configured
+        horizon = None if self._horizon is None else self._horizon * height
+        if self._configured is not None:
+            horizon = scaling.to_working(self._configured * image.shape[0])
         return FrameContext(
-            horizon=None if horizon is None else horizon * height,
+            horizon=horizon,
             tracked=self._tracker.curves if is_known else None,
             prior_horizon=None if self._prior_horizon is None or not is_known else self._prior_horizon * height,
         )

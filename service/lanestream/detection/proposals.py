@@ -15,7 +15,6 @@ from lanestream.detection.interface import FrameContext
 from lanestream.detection.marking_filter import Ridges, find_ridges
 from lanestream.detection.vanishing_point import (
     KNOWN_HORIZON,
-    NEAR_PRIOR,
     WIDE,
     find_lines,
     refine,
@@ -115,8 +114,7 @@ def _search_road(gray: Image, context: FrameContext, prior: EgoPrior | None) -> 
     """Returns the vanishing point, near that of the prior, or else where the lines of the edges meet."""
     height, width = gray.shape
     if prior is not None and prior.sides:
-        ridges = find_ridges(gray, prior.vanishing_point)
-        return _Road(refine(prior.vanishing_point, ridges, width, height - 1.0, NEAR_PRIOR), ridges)
+        return _Road(prior.vanishing_point, find_ridges(gray, prior.vanishing_point))
     horizon = context.horizon
     if horizon is not None:
         # A prior without boundaries, in the dark or in a sharp curve, still gives the horizon.
