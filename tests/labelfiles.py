@@ -16,7 +16,7 @@ from scipy.io import savemat
 from lanestream.errors import LabelError
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.checking import DatasetCheck
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.datasets.reading import read_dataset, scan_dataset
 from lanestream_exporter.scenes import render_still, sample_clip, sample_scene, write_clip
 
@@ -55,7 +55,7 @@ def write_drive(folder: Path) -> None:
     write_clip(scene, folder / "drive.mp4", folder / "drive.jsonl")
 
 
-def read(path: Path, format_name: str = "auto") -> list[LabelledFrame]:
+def read(path: Path, format_name: str = "auto") -> list[LabeledFrame]:
     """Returns the labeled frames of a data set, and checks that their images have the right size."""
     frames = []
     for frame, image in read_dataset(path, format_name):

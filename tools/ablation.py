@@ -30,8 +30,8 @@ from lanestream.errors import LanestreamError
 from lanestream.host import processors
 from lanestream.inference.providers import RuntimeOptions
 from lanestream.road.curve import Curves
-from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.manifest import DatasetCollection, LabelledClip
+from lanestream_exporter.datasets.labels import LabeledFrame
+from lanestream_exporter.datasets.manifest import DatasetCollection, LabeledClip
 from lanestream_exporter.evaluation.boundaries import FrameMatches, ReportedBoundary, match, match_ego
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.scenes.clip import render_clip, sample_clip
@@ -59,7 +59,7 @@ class FrameSequence:
     group: str
     frames: tuple[bytes, ...]
     fps: float
-    labels: dict[int, LabelledFrame]
+    labels: dict[int, LabeledFrame]
 
 
 def _replace(module: Any, name: str, new: Any) -> Leave:
@@ -192,7 +192,7 @@ def _real_file(folder: Path, data: Path | None) -> Path:
     return _write(folder / "real.pickle", make)
 
 
-def _stream(clip: LabelledClip) -> FrameSequence:
+def _stream(clip: LabeledClip) -> FrameSequence:
     video = cv2.VideoCapture(str(clip.video))
     fps = video.get(cv2.CAP_PROP_FPS)
     first, last = clip.frames.start, min(clip.frames.stop, clip.frames.start + CLIP_FRAMES)
@@ -203,7 +203,7 @@ def _stream(clip: LabelledClip) -> FrameSequence:
         if not is_read:
             break
         frames.append(_jpeg(image))
-    labels = {index - first: frame for index, frame in clip.labelled.items() if first <= index < last}
+    labels = {index - first: frame for index, frame in clip.labeled.items() if first <= index < last}
     return FrameSequence(f"{clip.name} stream", tuple(frames), fps, labels)
 
 

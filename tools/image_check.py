@@ -233,7 +233,7 @@ def check_detection(url: str, images: list[bytes]) -> None:
 
 
 def check_stop(engine: Engine, url: str, images: list[bytes]) -> None:
-    """Checks that after SIGTERM a container tells its streams, answers all accepted frames and ends in time."""
+    """Checks that after SIGTERM a container notifies its streams, answers all accepted frames and ends in time."""
     with connect(
         f"{url.replace('http', 'ws', 1)}/v1/stream", subprotocols=[Subprotocol(SUBPROTOCOL)], compression=None
     ) as socket:
@@ -249,7 +249,7 @@ def check_stop(engine: Engine, url: str, images: list[bytes]) -> None:
     if types.count("lanes") != len(frames) or "draining" not in types:
         raise CheckError(f"SIGTERM with {len(frames)} frames in flight: the stream received {', '.join(types)}")
     passed(
-        f"SIGTERM: the stream is told and its {len(frames)} frames are answered, exit code {code} after {took:.1f} s"
+        f"SIGTERM: the stream was notified, its {len(frames)} frames were answered, exit code {code} after {took:.1f} s"
     )
 
 

@@ -20,7 +20,7 @@ from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
 from lanestream_exporter.evaluation.measuring import EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
-from lanestream_exporter.evaluation.score import score as score_results
+from lanestream_exporter.evaluation.score import score_results
 from lanestream_exporter.evaluation.tables import tables
 
 if TYPE_CHECKING:

@@ -104,7 +104,7 @@ def doctor(context: click.Context, /, required: str | None, as_json: bool, **giv
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = _PIPE_WIDTH
-        for table in tables(diagnosis):
+        for table in diagnosis_tables(diagnosis):
             console.print(table)
             console.print()
     if diagnosis.problem is not None:
@@ -132,7 +132,7 @@ def diagnose(settings: Settings, required: str | None = None) -> Diagnosis:
     return Diagnosis(_software(), cpu(), gpu(), _installed_providers(), provider, tuple(networks), problem)
 
 
-def tables(diagnosis: Diagnosis) -> Iterator[Table]:
+def diagnosis_tables(diagnosis: Diagnosis) -> Iterator[Table]:
     """Yields the diagnosis as tables for a terminal."""
     software = ", ".join(f"{name} {version}" for name, version in diagnosis.software.items())
     installed = f"{', '.join(diagnosis.installed)}; requested: {diagnosis.asked}"

@@ -63,9 +63,7 @@ def test_splits_share_no_frame(datasets: DatasetCollection) -> None:
 
 
 def test_the_clips_of_a_split_are_the_videos_that_it_labels(datasets: DatasetCollection) -> None:
-    found = {
-        split: [(clip.name, clip.frames, len(clip.labelled)) for clip in datasets.clips(split)] for split in SPLITS
-    }
+    found = {split: [(clip.name, clip.frames, len(clip.labeled)) for clip in datasets.clips(split)] for split in SPLITS}
     whole = range(1_000_000)
     assert found == {
         "train": [

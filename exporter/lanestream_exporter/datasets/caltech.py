@@ -21,7 +21,7 @@ from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry
 from lanestream_exporter.datasets.files import DataFolder, drive_of, error_at, path_in_labels
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import LabelledLane, points_of
+from lanestream_exporter.datasets.labels import LabeledLane, points_of
 
 _SUFFIX: Final = ".ccvl"
 _CURVE_STEPS: Final = 100  # of the curve parameter, as in the data set's own evaluation
@@ -79,7 +79,7 @@ def _entry(frame: Any, place: str, path: Path, folder: DataFolder) -> LabelEntry
             lane_id = int(label.obj) if np.size(label.obj) == 1 else None
             # These labels count pixels from one, this project from zero.
             curve = bezier(points) - 1.0 if shape == "spline" else points - 1.0
-            lanes[f"label {number}"] = LabelledLane(curve, lane_id, None, kind, color)
+            lanes[f"label {number}"] = LabeledLane(curve, lane_id, None, kind, color)
         elif len(points):
             others.append(shape)
     image = folder.find(path.parent / path_in_labels(frame.frame))

@@ -7,8 +7,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.labels import LabelledFrame
-from lanestream_exporter.datasets.reading import LabelledSample
+from lanestream_exporter.datasets.labels import LabeledFrame
+from lanestream_exporter.datasets.reading import LabeledSample
 from lanestream_exporter.datasets.splits import refuse_leak
 
 
@@ -25,7 +25,7 @@ class DatasetContents:
     others: Counter[str] = field(default_factory=Counter)
     rows: tuple[float, float] | None = None
 
-    def add(self, frame: LabelledFrame) -> None:
+    def add(self, frame: LabeledFrame) -> None:
         """Counts a frame."""
         self.groups[frame.group] += 1
         self.sizes[frame.width, frame.height] += 1
@@ -80,7 +80,7 @@ class DatasetCheck:
         self._places: dict[tuple[str, str], str] = {}
         self._images: dict[bytes, _FirstUse] = {}
 
-    def add(self, found: LabelledSample | LabelError) -> None:
+    def add(self, found: LabeledSample | LabelError) -> None:
         """Adds one record."""
         if isinstance(found, LabelError):
             self.faults.append(found)
@@ -89,7 +89,7 @@ class DatasetCheck:
         self.contents.others.update(found.entry.others)
         self._find_duplicate(found)
 
-    def _find_duplicate(self, sample: LabelledSample) -> None:
+    def _find_duplicate(self, sample: LabeledSample) -> None:
         place, source, group = sample.entry.place, sample.frame.source, sample.frame.group
         if (group, source) in self._places:
             first = self._places[group, source]
@@ -121,6 +121,6 @@ class DatasetCheck:
         return sorted(faults, key=str)
 
 
-def _digest(sample: LabelledSample) -> bytes:
+def _digest(sample: LabeledSample) -> bytes:
     height, width = sample.image.shape[:2]
     return hashlib.blake2b(sample.image.tobytes(), digest_size=16, salt=b"%d,%d" % (width, height)).digest()

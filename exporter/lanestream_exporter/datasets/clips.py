@@ -18,10 +18,10 @@ from lanestream_exporter.datasets.files import (
     scan_json_lines,
 )
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import PARTIAL, Coverage, LabelledFrame, LabelledLane, points_of
+from lanestream_exporter.datasets.labels import PARTIAL, Coverage, LabeledFrame, LabeledLane, points_of
 
 _NEEDED: Final = "frame, width, height and lanes"
-# The optional fields of a lane, in the order of LabelledLane's fields.
+# The optional fields of a lane, in the order of LabeledLane's fields.
 _LANE_FIELDS: Final[Mapping[str, type]] = {"id": int, "position": int, "type": str, "color": str}
 
 
@@ -41,12 +41,12 @@ def clip_entries(folder: DataFolder) -> LabelEntries:
         yield from sorted(_file_entries(path, folder), key=_video_index)
 
 
-def read_clip_labels(path: Path, coverage: Coverage = PARTIAL) -> dict[int, LabelledFrame]:
+def read_clip_labels(path: Path, coverage: Coverage = PARTIAL) -> dict[int, LabeledFrame]:
     """Returns the labeled frames of a clip by their index in the video, without looking for the video.
 
     `coverage` says what the labels cover. Raises LabelError that names the file and the line.
     """
-    frames: dict[int, LabelledFrame] = {}
+    frames: dict[int, LabeledFrame] = {}
     for place, record in read_json_lines(path):
         try:
             frames[int(record["frame"])] = _frame(record, path, coverage)
@@ -55,11 +55,11 @@ def read_clip_labels(path: Path, coverage: Coverage = PARTIAL) -> dict[int, Labe
     return frames
 
 
-def _frame(record: dict[str, Any], path: Path, coverage: Coverage) -> LabelledFrame:
+def _frame(record: dict[str, Any], path: Path, coverage: Coverage) -> LabeledFrame:
     lanes = tuple(_lanes(record))
     clip = str(record.get("clip", path.stem))
     source = f"{clip}#{record['frame']}"
-    return LabelledFrame(int(record["width"]), int(record["height"]), lanes, Path(clip).stem, source, coverage)
+    return LabeledFrame(int(record["width"]), int(record["height"]), lanes, Path(clip).stem, source, coverage)
 
 
 def _file_entries(path: Path, folder: DataFolder) -> LabelEntries:
@@ -107,13 +107,13 @@ def _video_if_there(clip: Path, path: Path, folder: DataFolder) -> Path | None:
         return None
 
 
-def _lanes(record: dict[str, Any]) -> Iterator[LabelledLane]:
+def _lanes(record: dict[str, Any]) -> Iterator[LabeledLane]:
     for number, lane in enumerate(record["lanes"], start=1):
         try:
             points = points_of(lane["points"])
         except ValueError as error:
             raise ValueError(f"lane {number}: {error}") from None
-        yield LabelledLane(points, *(_field(lane, name, kind) for name, kind in _LANE_FIELDS.items()))
+        yield LabeledLane(points, *(_field(lane, name, kind) for name, kind in _LANE_FIELDS.items()))
 
 
 def _field(lane: dict[str, Any], name: str, kind: type) -> Any:

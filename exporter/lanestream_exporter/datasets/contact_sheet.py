@@ -11,7 +11,7 @@ import numpy as np
 
 from lanestream.errors import SourceError
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 
 _COLUMNS: Final = 6
 _WIDTH: Final = 320  # pixels of a thumbnail
@@ -48,7 +48,7 @@ class ContactSheet:
     def __len__(self) -> int:
         return len(self._chosen())
 
-    def add(self, frame: LabelledFrame, image: Image) -> None:
+    def add(self, frame: LabeledFrame, image: Image) -> None:
         """Adds a frame, or skips it to keep the sheet evenly spread."""
         if self._seen % self._stride == 0:
             self._tiles.append(_tile(frame, image))
@@ -81,7 +81,7 @@ class ContactSheet:
         return page
 
 
-def _tile(frame: LabelledFrame, image: Image) -> Image:
+def _tile(frame: LabeledFrame, image: Image) -> Image:
     """Returns the thumbnail of a frame with its lanes, and its name underneath."""
     scale = _WIDTH / frame.width
     thumbnail = cv2.resize(image, (_WIDTH, max(1, round(frame.height * scale))), interpolation=cv2.INTER_AREA)

@@ -12,7 +12,7 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry
 from lanestream_exporter.datasets.files import DataFolder, drive_of, error_at, read_text
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import LabelledLane, points_of
+from lanestream_exporter.datasets.labels import LabeledLane, points_of
 
 _SUFFIX: Final = ".lines.txt"
 _ACCEPTED: Final = "one lane per line is accepted: x y x y ..."
@@ -40,7 +40,7 @@ def culane_entries(folder: DataFolder) -> LabelEntries:
             )
 
 
-def _lanes(path: Path) -> tuple[dict[str, LabelledLane], list[LabelError]]:
+def _lanes(path: Path) -> tuple[dict[str, LabeledLane], list[LabelError]]:
     lanes, faults = {}, []
     try:
         lines = read_text(path, _ACCEPTED).splitlines()
@@ -52,7 +52,7 @@ def _lanes(path: Path) -> tuple[dict[str, LabelledLane], list[LabelError]]:
             if len(values) % 2:
                 raise ValueError(f"{len(values)} numbers are not pairs of x and y")
             if values:
-                lanes[f"line {number}"] = LabelledLane(points_of(list(zip(values[::2], values[1::2], strict=True))))
+                lanes[f"line {number}"] = LabeledLane(points_of(list(zip(values[::2], values[1::2], strict=True))))
         except ValueError as error:
             faults.append(LabelError(f"{path}:{number}: {error}", _ACCEPTED))
     return lanes, faults

@@ -20,7 +20,7 @@ from lanestream.errors import LabelError
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, color_in, kind_in, numbered, size_of
 from lanestream_exporter.datasets.files import DataFolder, drive_of, error_at, field_error, path_in_labels
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import LabelledLane, points_of
+from lanestream_exporter.datasets.labels import LabeledLane, points_of
 
 _SHAPES: Final = frozenset({"box", "polygon", "points", "cuboid", "skeleton", "ellipse", "mask"})
 _POSITION: Final = re.compile(r"[+-]?[1-9]")
@@ -86,7 +86,7 @@ def _image_entry(image: Element, place: str, export: _Export) -> LabelEntry:
     name, base = path_in_labels(image.attrib["name"]), export.path.parent
     subset = path_in_labels(image.get("subset") or ".")
     found = export.folder.find(base / "images" / name, base / name, base / "images" / subset / name)
-    lanes: list[LabelledLane] = []
+    lanes: list[LabeledLane] = []
     others: list[str] = []
     for shape in image:
         if shape.tag == "polyline":
@@ -103,7 +103,7 @@ def _image_entry(image: Element, place: str, export: _Export) -> LabelEntry:
     )
 
 
-def _lane(shape: Element, where: str, label: str, lane_id: int | None) -> LabelledLane:
+def _lane(shape: Element, where: str, label: str, lane_id: int | None) -> LabeledLane:
     try:
         points = points_of([[float(n) for n in pair.split(",")] for pair in shape.attrib["points"].split(";") if pair])
     except ValueError:
@@ -115,12 +115,12 @@ def _lane(shape: Element, where: str, label: str, lane_id: int | None) -> Labell
     position = attributes.get("position", "")
     if lane_id is None and attributes.get("id", "").isdecimal():
         lane_id = int(attributes["id"])
-    return LabelledLane(points, lane_id, int(position) if _POSITION.fullmatch(position) else None, kind, color)
+    return LabeledLane(points, lane_id, int(position) if _POSITION.fullmatch(position) else None, kind, color)
 
 
 def _track_entries(export: _Export) -> LabelEntries:
     """Yields the frames in which a track has a visible polyline."""
-    frames: dict[int, dict[str, LabelledLane]] = {}
+    frames: dict[int, dict[str, LabeledLane]] = {}
     for track in export.root.iterfind("track"):
         where = f"track {track.get('id')}"
         for shape in track.iterfind("polyline"):
@@ -173,7 +173,7 @@ class _VideoTask:
             video = folder.find(base / source, folder.root / source, folder.root / "clips" / source)
         return cls(export, video, source.stem, size_of(*size) if all(size) else None)
 
-    def entry(self, index: int, place: str, lanes: dict[str, LabelledLane]) -> LabelEntry:
+    def entry(self, index: int, place: str, lanes: dict[str, LabeledLane]) -> LabelEntry:
         """Returns the entry of a frame. Raises LabelError if its image is missing."""
         if self.video is not None:
             source, image = f"{self.video.name}#{index}", ImageLocation(self.video, index)

@@ -10,7 +10,7 @@ from typing import Any, Final
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import LabelledLane
+from lanestream_exporter.datasets.labels import LabeledLane
 
 _KINDS: Final[Mapping[str, str]] = {
     **{kind: kind for kind in ("solid", "dashed", "double", "botts", "edge")},
@@ -38,7 +38,7 @@ class LabelEntry:
     source: str
     group: str
     image: ImageLocation
-    lanes: Mapping[str, LabelledLane]
+    lanes: Mapping[str, LabeledLane]
     size: tuple[int, int] | None = None
     video: Path | None = None
     index: int | None = None
@@ -61,7 +61,7 @@ class LabelFormat:
     recognizes: Callable[[Path, bytes], bool]
 
 
-def numbered(lanes: Iterable[LabelledLane], noun: str = "lane") -> dict[str, LabelledLane]:
+def numbered(lanes: Iterable[LabeledLane], noun: str = "lane") -> dict[str, LabeledLane]:
     """Returns lanes by their place in a list, counted from one."""
     return {f"{noun} {number}": lane for number, lane in enumerate(lanes, start=1)}
 

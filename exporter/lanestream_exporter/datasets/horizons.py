@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 
 # The standard deviation of a frame's horizon within its drive, as a share of the height: cameras pitch, roads rise and
 # fall.
@@ -39,7 +39,7 @@ def shared_horizon(lanes: Sequence[FloatArray], height: int, expected: float | N
     return float(rows[int(np.argmin(costs))])
 
 
-def drive_horizons(frames: Sequence[LabelledFrame]) -> list[float | None]:
+def drive_horizons(frames: Sequence[LabeledFrame]) -> list[float | None]:
     """Returns the horizon of each frame of one drive; frames with too few labels get about the drive's median."""
     lanes = [[lane.points for lane in frame.lanes if len(lane.points) >= 3] for frame in frames]
     alone = [shared_horizon(points, frame.height, None) for points, frame in zip(lanes, frames, strict=True)]

@@ -24,7 +24,7 @@ from lanestream.road.curve import Curve, Curves, FloatArray
 from lanestream.road.view import Image, RoadView, Scaling, Spans
 from lanestream_exporter.datasets.horizons import drive_horizons
 from lanestream_exporter.datasets.images import ImageLocation, ImageReader
-from lanestream_exporter.datasets.labels import PARTIAL, LabelledFrame, LabelledImages, LabelledLane, fitted_curve
+from lanestream_exporter.datasets.labels import PARTIAL, LabeledFrame, LabeledImages, LabeledLane, fitted_curve
 
 # Boundaries are not fitted closer to the horizon than this share of the rows below it.
 _TOP_SHARE: Final = 0.06
@@ -48,16 +48,16 @@ class LabelPropagation:
     longest: int = 60
     agreement: float = 6.0
 
-    def frames(self, video: Path, labelled: Mapping[int, LabelledFrame]) -> LabelledImages:
-        """Yields labeled frames between those of `labelled` (by index in the video) with their BGR images (H, W, 3).
+    def frames(self, video: Path, labeled: Mapping[int, LabeledFrame]) -> LabeledImages:
+        """Yields labeled frames between those of `labeled` (by index in the video) with their BGR images (H, W, 3).
 
         Both are at the working width, at which boundaries are fitted. Frames on which no boundary can be labeled are
         left out. Raises SourceError if the video can't be read.
         """
-        indices = sorted(labelled)
-        horizons = drive_horizons([labelled[index] for index in indices])
+        indices = sorted(labeled)
+        horizons = drive_horizons([labeled[index] for index in indices])
         keys = [
-            _KeyFrame(index, labelled[index], horizon)
+            _KeyFrame(index, labeled[index], horizon)
             for index, horizon in zip(indices, horizons, strict=True)
             if horizon is not None
         ]
@@ -69,7 +69,7 @@ class LabelPropagation:
 
     def _propagate(
         self, first: _KeyFrame, last: _KeyFrame, images: Sequence[Image]
-    ) -> Iterator[tuple[int, LabelledFrame, Image]]:
+    ) -> Iterator[tuple[int, LabeledFrame, Image]]:
         """Yields the labeled frames of a stretch with their indices; `images` include both key frames."""
         ids = [lane_id for lane_id in first.boundaries if lane_id in last.boundaries]
         if not ids:
@@ -91,7 +91,7 @@ class LabelPropagation:
                 coverage = nearer.frame.coverage if complete and len(lanes) == len(ids) else PARTIAL
                 yield first.index + number, replace(nearer.frame, lanes=lanes, coverage=coverage), images[number]
 
-    def _label(self, lane: LabelledLane, passes: tuple[Curve, Curve], step: _Step, index: int) -> LabelledLane | None:
+    def _label(self, lane: LabeledLane, passes: tuple[Curve, Curve], step: _Step, index: int) -> LabeledLane | None:
         """Returns the mean of both passes as a label like `lane`; None if they disagree or little of it is visible."""
         rows = np.linspace(step.spans.bottom[index], step.spans.top[index], _POINTS)
         forward, backward = (curve.x(rows) for curve in passes)
@@ -118,7 +118,7 @@ def _fit_pass(curves: Curves, steps: Sequence[_Step], images: Sequence[Image]) -
 class _KeyBoundary:
     """A labeled boundary as the best curve under its frame's horizon, between the rows (top, bottom) of its label."""
 
-    lane: LabelledLane
+    lane: LabeledLane
     curve: Curve
     rows: tuple[float, float]
 
@@ -130,7 +130,7 @@ class _KeyFrame:
     that these are all labels of the frame.
     """
 
-    def __init__(self, index: int, frame: LabelledFrame, horizon: float) -> None:
+    def __init__(self, index: int, frame: LabeledFrame, horizon: float) -> None:
         horizon = Scaling.to_working_width(frame.width).to_working(horizon)
         self.index, self.frame = index, frame.at_working_width
         self.view = RoadView(self.frame.width, self.frame.height, horizon)
@@ -146,7 +146,7 @@ class _KeyFrame:
         """Returns the boundaries with these ids."""
         return Curves.of([self.boundaries[lane_id].curve for lane_id in ids])
 
-    def _boundary(self, lane: LabelledLane) -> _KeyBoundary | None:
+    def _boundary(self, lane: LabeledLane) -> _KeyBoundary | None:
         points = lane.points[lane.points[:, 1] > self.view.row_at(_TOP_SHARE)]
         if len(points) < 3:
             return None

@@ -25,7 +25,7 @@ from lanestream_exporter.datasets.files import (
     read_text,
 )
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import LabelledLane, points_of
+from lanestream_exporter.datasets.labels import LabeledLane, points_of
 
 _ACCEPTED: Final = "a JSON file of LabelMe is accepted"
 _LINES: Final = ("linestrip", "line")
@@ -68,7 +68,7 @@ def _entry(record: dict[str, Any], path: Path, folder: DataFolder) -> LabelEntry
     return LabelEntry(str(path), source, drive_of(image.path.parent), image, lanes, size, others=tuple(others))
 
 
-def _lane(shape: dict[str, Any], number: int) -> LabelledLane:
+def _lane(shape: dict[str, Any], number: int) -> LabeledLane:
     try:
         points = points_of(shape["points"])
     except ValueError as error:
@@ -76,7 +76,7 @@ def _lane(shape: dict[str, Any], number: int) -> LabelledLane:
     flags = " ".join(name for name, is_set in (shape.get("flags") or {}).items() if is_set)
     words = re.findall(r"[a-z]+", f"{shape.get('label', '')} {flags}".lower())
     group = shape.get("group_id")
-    return LabelledLane(points, None if group is None else int(group), None, kind_in(words), color_in(words))
+    return LabeledLane(points, None if group is None else int(group), None, kind_in(words), color_in(words))
 
 
 def _image(record: dict[str, Any], path: Path, folder: DataFolder) -> ImageLocation:

@@ -18,7 +18,7 @@ POINT_TOLERANCE: Final = 1.0
 
 
 @dataclass(frozen=True)
-class LabelledLane:
+class LabeledLane:
     """One lane boundary as a labeler or the renderer drew it.
 
     `points` is an (N, 2) float array of image pixels (x right, y down, pixel centers at integers), from the lowest
@@ -51,7 +51,7 @@ WHOLE = Coverage(ego=True, open_sides=())
 
 
 @dataclass(frozen=True)
-class LabelledFrame:
+class LabeledFrame:
     """The labels of one frame: its size in pixels, its lane boundaries, and what they cover.
 
     `group` names the drive or clip that the frame belongs to; `source` names the frame within its data set.
@@ -59,13 +59,13 @@ class LabelledFrame:
 
     width: int
     height: int
-    lanes: tuple[LabelledLane, ...]
+    lanes: tuple[LabeledLane, ...]
     group: str
     source: str
     coverage: Coverage = PARTIAL
 
     @property
-    def at_working_width(self) -> LabelledFrame:
+    def at_working_width(self) -> LabeledFrame:
         """The same labels in pixels of the working image, which detectors see."""
         scaling = Scaling.to_working_width(self.width)
         lanes = tuple(replace(lane, points=scaling.to_working(lane.points)) for lane in self.lanes)
@@ -81,10 +81,10 @@ class LabelledFrame:
 
 
 # Labeled frames with their BGR images (H, W, 3) uint8.
-LabelledImages = Iterator[tuple[LabelledFrame, Image]]
+LabeledImages = Iterator[tuple[LabeledFrame, Image]]
 
 
-def to_working(frame: LabelledFrame, image: Image) -> tuple[LabelledFrame, Image]:
+def to_working(frame: LabeledFrame, image: Image) -> tuple[LabeledFrame, Image]:
     """Returns a labeled frame and its BGR image (H, W, 3) uint8 at the working width."""
     return frame.at_working_width, working_image(image)[0]
 

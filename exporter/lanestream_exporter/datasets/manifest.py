@@ -23,8 +23,8 @@ from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.formats import AUTO, FORMATS
 from lanestream_exporter.datasets.images import ImageReader, video_size
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
-from lanestream_exporter.datasets.labels import Coverage, LabelledFrame, LabelledImages
-from lanestream_exporter.datasets.reading import labelled_frame, open_entry, read_entries
+from lanestream_exporter.datasets.labels import Coverage, LabeledFrame, LabeledImages
+from lanestream_exporter.datasets.reading import labeled_frame, open_entry, read_entries
 from lanestream_exporter.datasets.splits import (
     GroupSplit,
     Split,
@@ -92,12 +92,12 @@ class DatasetManifest(Section):
 
 
 @dataclass(frozen=True)
-class LabelledClip:
+class LabeledClip:
     """A video with labeled frames, by index, and the stretch of its frames that belongs to a split."""
 
     name: str
     video: Path
-    labelled: dict[int, LabelledFrame]
+    labeled: dict[int, LabeledFrame]
     frames: range
 
 
@@ -126,7 +126,7 @@ class DatasetCollection:
         """Whether the data folder holds at least one of the data sets."""
         return any(map(self._is_present, self.manifest.dataset))
 
-    def frames(self, split: Split) -> LabelledImages:
+    def frames(self, split: Split) -> LabeledImages:
         """Yields the labeled frames of a split, one data set after another. Raises LabelError for a bad record."""
         with ImageReader() as images:
             for spec, entry in self._entries(split):
@@ -135,7 +135,7 @@ class DatasetCollection:
                         raise sample
                     yield sample.frame, sample.image
 
-    def training_frames(self, propagation: LabelPropagation | None) -> LabelledImages:
+    def training_frames(self, propagation: LabelPropagation | None) -> LabeledImages:
         """Yields the frames of the training split, then those that `propagation` labels between them.
 
         Raises LabelError for a bad record and SourceError for a video that can't be read.
@@ -143,22 +143,22 @@ class DatasetCollection:
         yield from self.frames("train")
         if propagation is not None:
             for clip in self.clips("train"):
-                yield from propagation.frames(clip.video, clip.labelled)
+                yield from propagation.frames(clip.video, clip.labeled)
 
-    def clips(self, split: Split) -> Iterator[LabelledClip]:
+    def clips(self, split: Split) -> Iterator[LabeledClip]:
         """Yields the videos that have labeled frames in a split. Raises LabelError for a bad record."""
         for spec in self.manifest.dataset:
-            videos: dict[Path, dict[int, LabelledFrame]] = {}
+            videos: dict[Path, dict[int, LabeledFrame]] = {}
             for entry in self._entries_of(spec, split):
                 if entry.video is not None and entry.index is not None:
                     size = entry.size or video_size(entry.video)
-                    frame, faults = labelled_frame(entry, size, spec.coverage.coverage)
+                    frame, faults = labeled_frame(entry, size, spec.coverage.coverage)
                     if faults:
                         raise faults[0]
                     videos.setdefault(entry.video, {})[entry.index] = frame
-            for video, labelled in videos.items():
-                name = next(iter(labelled.values())).group
-                yield LabelledClip(name, video, labelled, clip_frames(spec.split, split, list(labelled)))
+            for video, labeled in videos.items():
+                name = next(iter(labeled.values())).group
+                yield LabeledClip(name, video, labeled, clip_frames(spec.split, split, list(labeled)))
 
     def require_splits(self, *splits: Split) -> None:
         """Raises LabelError if a split has no frames."""

@@ -25,7 +25,7 @@ from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry
 from lanestream_exporter.datasets.files import IMAGE_FOLDERS, DataFolder, drive_of, error_at
 from lanestream_exporter.datasets.images import ImageLocation, checked_header, file_bytes
-from lanestream_exporter.datasets.labels import LabelledLane
+from lanestream_exporter.datasets.labels import LabeledLane
 
 _MASK_FOLDERS: Final = frozenset({"mask", "masks", "segmentation"})
 _STEM_END: Final = "_mask"  # of a mask next to its image
@@ -82,7 +82,7 @@ def _read(path: Path) -> NDArray[np.int64]:
     return packed
 
 
-def _lanes(mask: NDArray[np.int64]) -> Iterator[tuple[str, LabelledLane]]:
+def _lanes(mask: NDArray[np.int64]) -> Iterator[tuple[str, LabeledLane]]:
     values = [value for value in np.unique(mask) if value]
     if len(values) > _MOST_INSTANCES:
         raise LabelError(
@@ -90,10 +90,10 @@ def _lanes(mask: NDArray[np.int64]) -> Iterator[tuple[str, LabelledLane]]:
         )
     if len(values) == 1:
         for number, points in enumerate(_pieces(mask != 0), start=1):
-            yield f"piece {number}", LabelledLane(points)
+            yield f"piece {number}", LabeledLane(points)
         return
     for number, value in enumerate(values, start=1):
-        yield f"instance {number}", LabelledLane(_centroids(mask == value), number)
+        yield f"instance {number}", LabeledLane(_centroids(mask == value), number)
 
 
 def _centroids(pixels: NDArray[np.bool_]) -> FloatArray:

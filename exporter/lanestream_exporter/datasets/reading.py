@@ -15,24 +15,24 @@ from lanestream_exporter.datasets.images import ImageReader
 from lanestream_exporter.datasets.labels import (
     PARTIAL,
     Coverage,
-    LabelledFrame,
-    LabelledImages,
-    LabelledLane,
+    LabeledFrame,
+    LabeledImages,
+    LabeledLane,
     checked_points,
     points_inside,
 )
 
 
 @dataclass(frozen=True)
-class LabelledSample:
+class LabeledSample:
     """A usable labeled frame: its record, its labels and its image, BGR (H, W, 3) uint8."""
 
     entry: LabelEntry
-    frame: LabelledFrame
+    frame: LabeledFrame
     image: Image
 
 
-def read_dataset(path: Path, format: str = AUTO) -> LabelledImages:  # noqa: A002
+def read_dataset(path: Path, format: str = AUTO) -> LabeledImages:  # noqa: A002
     """Yields the labeled frames of the data set at `path`, a folder or a label file, with their images.
 
     Images are BGR (H, W, 3) uint8 and decoded one at a time. `frame.group` names the drive or clip. `format` is one of
@@ -44,7 +44,7 @@ def read_dataset(path: Path, format: str = AUTO) -> LabelledImages:  # noqa: A00
         yield sample.frame, sample.image
 
 
-def scan_dataset(path: Path, format: str = AUTO) -> Iterator[LabelledSample | LabelError]:  # noqa: A002
+def scan_dataset(path: Path, format: str = AUTO) -> Iterator[LabeledSample | LabelError]:  # noqa: A002
     """Yields the samples of the data set at `path`, and every fault of an unusable record instead of raising it.
 
     Raises LabelError if there is no data set at `path`, or if its format can't be recognized.
@@ -71,7 +71,7 @@ def read_entries(path: Path, format: str = AUTO) -> LabelEntries:  # noqa: A002
 
 def open_entry(
     entry: LabelEntry, images: ImageReader, coverage: Coverage = PARTIAL
-) -> Iterator[LabelledSample | LabelError]:
+) -> Iterator[LabeledSample | LabelError]:
     """Yields the sample of an entry, or everything that is wrong with it."""
     faults: list[LabelError] = []
     image, size = None, entry.size
@@ -85,18 +85,18 @@ def open_entry(
         if size != actual:
             one, other = (" x ".join(map(str, pair)) for pair in (actual, size))
             faults.append(LabelError(f"{entry.place}: {entry.source} is {one}, but its labels are for {other}"))
-    frame, lane_faults = labelled_frame(entry, size, coverage) if size is not None else (None, [])
+    frame, lane_faults = labeled_frame(entry, size, coverage) if size is not None else (None, [])
     faults += lane_faults
     yield from faults
     if image is not None and frame is not None and not faults:
-        yield LabelledSample(entry, frame, image)
+        yield LabeledSample(entry, frame, image)
 
 
-def labelled_frame(
+def labeled_frame(
     entry: LabelEntry, size: tuple[int, int], coverage: Coverage
-) -> tuple[LabelledFrame, list[LabelError]]:
+) -> tuple[LabeledFrame, list[LabelError]]:
     """Returns the labels of an entry for an image of `size` (width, height), and what is wrong with its lanes."""
-    lanes: list[LabelledLane] = []
+    lanes: list[LabeledLane] = []
     faults = []
     for name, lane in entry.lanes.items():
         points = lane.points
@@ -108,4 +108,4 @@ def labelled_frame(
             lanes.append(replace(lane, points=checked_points(points, *size)))
         except ValueError as error:
             faults.append(LabelError(f"{entry.place}: {name}: {error}"))
-    return LabelledFrame(*size, tuple(lanes), entry.group, entry.source, coverage), faults
+    return LabeledFrame(*size, tuple(lanes), entry.group, entry.source, coverage), faults

@@ -109,12 +109,12 @@ def split_of(rule: SplitRule, entry: LabelEntry, validation_groups: frozenset[st
     return next((split for split in SPLITS if entry.index in rule.range_of(split)), None)
 
 
-def clip_frames(rule: SplitRule, split: Split, labelled: Sequence[int]) -> range:
-    """Returns the frames of a video that belong to `split`; `labelled` are the indices of its labeled frames there."""
+def clip_frames(rule: SplitRule, split: Split, labeled: Sequence[int]) -> range:
+    """Returns the frames of a video that belong to `split`; `labeled` are the indices of its labeled frames there."""
     if isinstance(rule, FrameSplit):
         return rule.range_of(split)
     if isinstance(rule, RecordSplit):
-        return range(min(labelled), max(labelled) + 1)
+        return range(min(labeled), max(labeled) + 1)
     return _WHOLE_VIDEO
 
 

@@ -22,7 +22,7 @@ from lanestream_exporter.datasets.files import (
     scan_json_lines,
 )
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import LabelledLane
+from lanestream_exporter.datasets.labels import LabeledLane
 
 _NEEDED: Final = "raw_file, h_samples and lanes"
 
@@ -56,7 +56,7 @@ def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -
     return LabelEntry(place, folder.name(image), group, ImageLocation(image), lanes, split=record.get("split"))
 
 
-def _lanes(record: dict[str, Any]) -> Iterator[LabelledLane]:
+def _lanes(record: dict[str, Any]) -> Iterator[LabeledLane]:
     """Yields the lanes that are present. A column below zero is absent; a lane with one row left is dropped."""
     rows = np.asarray(record["h_samples"], dtype=float)
     for number, columns in enumerate(record["lanes"], start=1):
@@ -65,4 +65,4 @@ def _lanes(record: dict[str, Any]) -> Iterator[LabelledLane]:
             raise ValueError(f"lane {number} has {x.size} columns, but there are {rows.size} h_samples")
         present = ~(x < 0)
         if present.sum() >= 2:
-            yield LabelledLane(np.stack([x[present], rows[present]], axis=1)[::-1].copy())
+            yield LabeledLane(np.stack([x[present], rows[present]], axis=1)[::-1].copy())

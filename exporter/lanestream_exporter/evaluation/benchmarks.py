@@ -22,7 +22,7 @@ from scipy.optimize import linear_sum_assignment
 
 from lanestream.road.curve import FloatArray
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
 from lanestream_exporter.samples.patches import columns_at
 
@@ -47,7 +47,7 @@ CULANE_MIN_IOU: Final = 0.5
 _CULANE_ROWS: Final = 72
 
 
-def submitted_columns(reports: Sequence[ReportedBoundary], rows: FloatArray, frame: LabelledFrame) -> list[FloatArray]:
+def submitted_columns(reports: Sequence[ReportedBoundary], rows: FloatArray, frame: LabeledFrame) -> list[FloatArray]:
     """Returns the columns (R,) at `rows` that a user would submit for each reported boundary, NaN where absent.
 
     Only the boundaries of the ego lane and of the adjacent lanes are submitted. Each extends from the image border,
@@ -77,7 +77,7 @@ class TuSimpleScore:
     fn: float
 
 
-def tusimple_frame(reports: Sequence[ReportedBoundary], frame: LabelledFrame) -> TuSimpleScore:
+def tusimple_frame(reports: Sequence[ReportedBoundary], frame: LabeledFrame) -> TuSimpleScore:
     """Scores a frame of any size, with its labels and reports scaled to 1280 x 720."""
     scale = np.array([TUSIMPLE_SIZE[0] / frame.width, TUSIMPLE_SIZE[1] / frame.height])
     rows = TUSIMPLE_ROWS / scale[1]
@@ -132,7 +132,7 @@ class CULaneCounts:
     fn: int
 
 
-def culane_frame(reports: Sequence[ReportedBoundary], frame: LabelledFrame) -> CULaneCounts:
+def culane_frame(reports: Sequence[ReportedBoundary], frame: LabeledFrame) -> CULaneCounts:
     """Counts the reported boundaries of a frame against its labels, drawn as stripes."""
     rows = np.linspace(0.0, frame.height - 1.0, _CULANE_ROWS + 1)
     columns = submitted_columns(reports, rows, frame)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 
 # Computes figures, each (R,), from sums of per-frame counts (R, C); a figure without data is NaN.
 FigureFunction = Callable[[FloatArray], dict[str, FloatArray]]
@@ -25,7 +25,7 @@ _RESAMPLES: Final = 2000
 _SEED: Final = 0
 
 
-def blocks(frames: Sequence[LabelledFrame]) -> NDArray[np.int64]:
+def blocks(frames: Sequence[LabeledFrame]) -> NDArray[np.int64]:
     """Returns the block number of each frame (N,), from 0.
 
     With ten drives or more, a block is a whole drive. Otherwise it is five neighboring labeled frames of a drive or,
@@ -43,7 +43,7 @@ def blocks(frames: Sequence[LabelledFrame]) -> NDArray[np.int64]:
 
 
 def point_estimates(
-    counts: FloatArray, frames: Sequence[LabelledFrame], figures: FigureFunction
+    counts: FloatArray, frames: Sequence[LabeledFrame], figures: FigureFunction
 ) -> dict[str, float | None]:
     """Returns the figures over all frames; `counts` is (N, C). A figure without data is None."""
     total = counts.sum(axis=0, keepdims=True) if len(frames) else np.zeros((1, counts.shape[1]))
@@ -51,7 +51,7 @@ def point_estimates(
 
 
 def intervals(
-    counts: FloatArray, frames: Sequence[LabelledFrame], figures: FigureFunction
+    counts: FloatArray, frames: Sequence[LabeledFrame], figures: FigureFunction
 ) -> dict[str, list[float] | None]:
     """Returns the 95 % interval [low, high] of each figure; None with fewer than two blocks.
 
@@ -85,7 +85,7 @@ def _number(value: float) -> float | None:
     return None if np.isnan(value) else round(value, 4)
 
 
-def _block_length(frames: Sequence[LabelledFrame]) -> int:
+def _block_length(frames: Sequence[LabeledFrame]) -> int:
     numbers = [frame.source.rpartition("#")[2] for frame in frames if "#" in frame.source]
     if len(numbers) < max(2, len(frames)) or not all(number.isdigit() for number in numbers):
         return STILLS

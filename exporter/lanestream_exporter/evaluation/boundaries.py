@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from lanestream.road.curve import Curve, FloatArray
 from lanestream.road.results import LaneBoundary
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import LabeledFrame, LabeledLane
 from lanestream_exporter.samples.patches import columns_at
 
 _MAX_MEAN, _MAX_MEDIAN, _MIN_OVERLAP = 15.0, 20.0, 0.5
@@ -54,7 +54,7 @@ class BoundaryMatch:
     """A right report: its index among the reports, its label, and their mean distance in pixels at 640 wide."""
 
     index: int
-    label: LabelledLane
+    label: LabeledLane
     error: float
 
 
@@ -68,7 +68,7 @@ class FrameMatches:
     absent: int = 0
 
 
-def match(reports: Sequence[ReportedBoundary], labels: Sequence[LabelledLane], frame: LabelledFrame) -> FrameMatches:
+def match(reports: Sequence[ReportedBoundary], labels: Sequence[LabeledLane], frame: LabeledFrame) -> FrameMatches:
     """Matches reports to `labels` one to one.
 
     A report beyond the outermost label of a side that is not completely labeled is neither right nor wrong, unless it
@@ -84,7 +84,7 @@ def match(reports: Sequence[ReportedBoundary], labels: Sequence[LabelledLane], f
     return FrameMatches(matches, wrong, len(labels) - len(matches))
 
 
-def match_ego(reports: Sequence[ReportedBoundary], frame: LabelledFrame) -> FrameMatches:
+def match_ego(reports: Sequence[ReportedBoundary], frame: LabeledFrame) -> FrameMatches:
     """Matches the reported ego boundaries to the labeled ones, separately for each side.
 
     A report for a side that has a label is right or wrong wherever it lies. A side without label and report is rightly
@@ -106,12 +106,12 @@ def match_ego(reports: Sequence[ReportedBoundary], frame: LabelledFrame) -> Fram
     return FrameMatches(tuple(matches), wrong, missed, absent)
 
 
-def ego_labels(frame: LabelledFrame) -> list[LabelledLane]:
+def ego_labels(frame: LabeledFrame) -> list[LabeledLane]:
     """Returns the labels of the ego lane's boundaries, left before right, without missing ones; see `ego_sides`."""
     return [label for label in ego_sides(frame) if label is not None]
 
 
-def ego_sides(frame: LabelledFrame) -> tuple[LabelledLane | None, LabelledLane | None]:
+def ego_sides(frame: LabeledFrame) -> tuple[LabeledLane | None, LabeledLane | None]:
     """Returns the labels of the ego lane's (left, right) boundary: by position, or else the nearest to the camera.
 
     A label without position is extrapolated to the row at 97 % of the height by a line through its lower half.
@@ -125,7 +125,7 @@ def ego_sides(frame: LabelledFrame) -> tuple[LabelledLane | None, LabelledLane |
     return None if left is None else frame.lanes[left[1]], None if right is None else frame.lanes[right[1]]
 
 
-def errors_along(report: ReportedBoundary, label: LabelledLane, width: int) -> tuple[FloatArray, FloatArray]:
+def errors_along(report: ReportedBoundary, label: LabeledLane, width: int) -> tuple[FloatArray, FloatArray]:
     """Returns (rows, distances) where both exist: up to 64 rows, distances across the line in pixels at 640 wide."""
     rows = np.linspace(label.points[:, 1].min(), label.points[:, 1].max(), _SAMPLES)
     rows = rows[(rows >= report.top) & (rows <= report.bottom)]
@@ -133,13 +133,13 @@ def errors_along(report: ReportedBoundary, label: LabelledLane, width: int) -> t
     return rows, across * 640.0 / width
 
 
-def _extrapolated(lane: LabelledLane, row: float) -> float:
+def _extrapolated(lane: LabeledLane, row: float) -> float:
     points = lane.points[np.argsort(-lane.points[:, 1])]
     lower = points[: max(4, len(points) // 2)]
     return float(np.polyval(np.polyfit(lower[:, 1], lower[:, 0], 1), row))
 
 
-def _distance(report: ReportedBoundary, label: LabelledLane, width: int) -> float:
+def _distance(report: ReportedBoundary, label: LabeledLane, width: int) -> float:
     """Returns the mean distance in pixels at 640 wide; infinity if the report does not match the label."""
     _, distance = errors_along(report, label, width)
     if len(distance) < _MIN_OVERLAP * _SAMPLES:
@@ -156,7 +156,7 @@ def _assign(distances: FloatArray) -> list[tuple[int, int]]:
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if finite[i, j]]
 
 
-def _beyond_labels(report: ReportedBoundary, frame: LabelledFrame) -> bool:
+def _beyond_labels(report: ReportedBoundary, frame: LabeledFrame) -> bool:
     """Returns whether at least half of the report lies outside the outermost label of a side that is not complete."""
     if not frame.lanes:
         return False

@@ -11,7 +11,7 @@ from sklearn.metrics import average_precision_score
 
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
-from lanestream_exporter.evaluation.outcomes import MOST_RANKED, RULES, FrameOutcome, JudgedCandidates
+from lanestream_exporter.evaluation.outcomes import MOST_RANKED, RULES, FrameEvaluation, JudgedCandidates
 from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE
 
 _BINS = 10
@@ -19,7 +19,7 @@ _BINS = 10
 ProbabilityField = Literal["probabilities", "decided"]
 
 
-def candidate_figures(outcomes: Sequence[FrameOutcome], threshold: float) -> dict[str, Any]:
+def candidate_figures(outcomes: Sequence[FrameEvaluation], threshold: float) -> dict[str, Any]:
     """Returns all figures of level A under both rules for false candidates; see docs/evaluation.md."""
     return {
         "threshold": threshold,
@@ -30,7 +30,7 @@ def candidate_figures(outcomes: Sequence[FrameOutcome], threshold: float) -> dic
 
 
 def clear_candidates(
-    outcomes: Sequence[FrameOutcome], rule: str, field: ProbabilityField = "probabilities"
+    outcomes: Sequence[FrameEvaluation], rule: str, field: ProbabilityField = "probabilities"
 ) -> tuple[NDArray[np.bool_], FloatArray]:
     """Returns (truth, probability), each (N,), of the candidates that are clearly true or false."""
     pairs = [_clear(judged, rule, field) for judged in _all(outcomes)]
@@ -39,7 +39,7 @@ def clear_candidates(
 
 
 def _judged(
-    outcomes: Sequence[FrameOutcome], rule: str, threshold: float, field: ProbabilityField = "probabilities"
+    outcomes: Sequence[FrameEvaluation], rule: str, threshold: float, field: ProbabilityField = "probabilities"
 ) -> dict[str, Any]:
     truth, probability = clear_candidates(outcomes, rule, field)
     counts = np.array([_confusion(*_clear(judged, rule, field), threshold) for judged in _all(outcomes)]).reshape(-1, 4)
@@ -95,7 +95,7 @@ def _calibration(truth: NDArray[np.bool_], probability: FloatArray) -> dict[str,
     return {"expected_error": round(error, 4) if len(truth) else None, "bins": bins}
 
 
-def _proposed(outcomes: Sequence[FrameOutcome], ego: bool) -> dict[str, Any]:
+def _proposed(outcomes: Sequence[FrameEvaluation], ego: bool) -> dict[str, Any]:
     """Returns how many labels have a true candidate among the first 1, 2, ... 32."""
     labels = [[p for p in judged.proposed if p.ego or not ego] for judged in _all(outcomes)]
     frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
@@ -116,7 +116,7 @@ def _recalls(counts: FloatArray) -> dict[str, FloatArray]:
     return {f"recall_{limit}": ratio(counts[:, limit - 1], counts[:, -1]) for limit in (8, 16, 32)}
 
 
-def _all(outcomes: Sequence[FrameOutcome]) -> list[JudgedCandidates]:
+def _all(outcomes: Sequence[FrameEvaluation]) -> list[JudgedCandidates]:
     return [outcome.candidates for outcome in outcomes if outcome.candidates is not None]
 
 

@@ -8,27 +8,27 @@ from typing import Any
 import numpy as np
 
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.benchmarks import culane_frame, tusimple_frame
 from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.boundaries import FrameMatches, errors_along, match, match_ego
-from lanestream_exporter.evaluation.outcomes import FrameOutcome, ego_pair
+from lanestream_exporter.evaluation.outcomes import FrameEvaluation, ego_pair
 
 _DEPTH_BINS = 10  # bins of the error by depth
 
 
-def boundary_figures(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+def boundary_figures(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns the figures of level B, for the ego pair and all boundaries; see docs/evaluation.md."""
     ego = [match_ego(outcome.reports, outcome.frame) for outcome in outcomes]
     return {"ego": _matched(outcomes, ego), "all": _matched(outcomes, [match_all(outcome) for outcome in outcomes])}
 
 
-def match_all(outcome: FrameOutcome) -> FrameMatches:
+def match_all(outcome: FrameEvaluation) -> FrameMatches:
     """Matches all reported boundaries of a frame to all its labels."""
     return match(outcome.reports, outcome.frame.lanes, outcome.frame)
 
 
-def field_figures(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+def field_figures(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns the figures of level C, for all lanes and the ego pair; see docs/evaluation.md."""
     pairs = [pair for outcome in outcomes if (pair := ego_pair(outcome)).frame.lanes]
     return {
@@ -38,7 +38,7 @@ def field_figures(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
     }
 
 
-def _matched(outcomes: Sequence[FrameOutcome], matched: Sequence[FrameMatches]) -> dict[str, Any]:
+def _matched(outcomes: Sequence[FrameEvaluation], matched: Sequence[FrameMatches]) -> dict[str, Any]:
     rows = [(len(m.matches), m.wrong, m.missed, m.absent, sum(b.error for b in m.matches), 1) for m in matched]
     counts = np.array(rows, dtype=float).reshape(-1, 6)
     right, wrong, missed, absent = (int(n) for n in counts[:, :4].sum(axis=0))
@@ -69,7 +69,7 @@ def _boundary_rates(counts: FloatArray) -> dict[str, FloatArray]:
     }
 
 
-def _by_depth(outcomes: Sequence[FrameOutcome], matched: Sequence[FrameMatches]) -> dict[str, Any]:
+def _by_depth(outcomes: Sequence[FrameEvaluation], matched: Sequence[FrameMatches]) -> dict[str, Any]:
     """Returns the mean error of right boundaries by depth, from the highest labeled row (0) to the bottom row (1)."""
     total, number = np.zeros(_DEPTH_BINS), np.zeros(_DEPTH_BINS)
     for outcome, frame_matches in zip(outcomes, matched, strict=True):
@@ -83,12 +83,12 @@ def _by_depth(outcomes: Sequence[FrameOutcome], matched: Sequence[FrameMatches])
     return {"samples": [int(n) for n in number], "mean_px_640": means}
 
 
-def _depth(rows: FloatArray, frame: LabelledFrame) -> FloatArray:
+def _depth(rows: FloatArray, frame: LabeledFrame) -> FloatArray:
     top = min(float(lane.points[:, 1].min()) for lane in frame.lanes)
     return np.clip((rows - top) / max(frame.height - 1.0 - top, 1.0), 0.0, 1.0)
 
 
-def _tusimple(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+def _tusimple(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     scores = [tusimple_frame(outcome.reports, outcome.frame) for outcome in outcomes]
     counts = np.array([(s.accuracy, s.fp, s.fn, 1.0) for s in scores]).reshape(-1, 4)
     return {
@@ -109,7 +109,7 @@ def _harmonic(precision: FloatArray, recall: FloatArray) -> FloatArray:
     return ratio(2.0 * precision * recall, precision + recall)
 
 
-def _culane(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+def _culane(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     counted = [culane_frame(outcome.reports, outcome.frame) for outcome in outcomes]
     counts = np.array([(c.tp, c.fp, c.fn) for c in counted], dtype=float).reshape(-1, 3)
     tp, fp, fn = (int(n) for n in counts.sum(axis=0))
@@ -128,5 +128,5 @@ def _culane_rates(counts: FloatArray) -> dict[str, FloatArray]:
     return {"precision": ratio(tp, tp + fp), "recall": ratio(tp, tp + fn), "f1": ratio(2.0 * tp, 2.0 * tp + fp + fn)}
 
 
-def _frames(outcomes: Sequence[FrameOutcome]) -> list[LabelledFrame]:
+def _frames(outcomes: Sequence[FrameEvaluation]) -> list[LabeledFrame]:
     return [outcome.frame for outcome in outcomes]

@@ -16,10 +16,10 @@ import numpy as np
 
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.horizons import shared_horizon
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.boundaries import ego_sides
-from lanestream_exporter.evaluation.outcomes import FrameOutcome
+from lanestream_exporter.evaluation.outcomes import FrameEvaluation
 from lanestream_exporter.samples.patches import columns_at
 
 METERS: Final = (10.0, 30.0)
@@ -37,14 +37,14 @@ class LateralValue(IntEnum):
     LABEL, REPORT, STRAIGHT, ROW, TOP = range(5)
 
 
-def lateral_figures(outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+def lateral_figures(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns the errors at both distances; see docs/evaluation.md."""
     values = np.array([_lateral_values(outcome) for outcome in outcomes]).reshape(-1, len(METERS), 2, len(LateralValue))
     frames = [outcome.frame for outcome in outcomes]
     return {f"{meters:.0f}m": _figures(values[:, i], frames, meters) for i, meters in enumerate(METERS)}
 
 
-def _figures(values: FloatArray, frames: Sequence[LabelledFrame], meters: float) -> dict[str, Any]:
+def _figures(values: FloatArray, frames: Sequence[LabeledFrame], meters: float) -> dict[str, Any]:
     label, report, straight, row, top = np.moveaxis(values, 2, 0)
     both = ~np.isnan(label) & ~np.isnan(report)
     constant = np.nanmean(np.where(both, label, np.nan), axis=0) if both.any(axis=0).all() else np.full(2, np.nan)
@@ -71,7 +71,7 @@ def _figures(values: FloatArray, frames: Sequence[LabelledFrame], meters: float)
     }
 
 
-def _lateral_values(outcome: FrameOutcome) -> FloatArray:
+def _lateral_values(outcome: FrameEvaluation) -> FloatArray:
     """Returns an array (2 distances, 2 sides, 5) indexed by `LateralValue`; NaN where unknown."""
     frame = outcome.frame
     values = np.full((len(METERS), 2, len(LateralValue)), np.nan)

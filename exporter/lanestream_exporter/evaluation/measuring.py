@@ -12,15 +12,15 @@ import numpy as np
 
 from lanestream.errors import LabelError, SourceError
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.labels import LabelledImages
-from lanestream_exporter.datasets.manifest import DatasetCollection, LabelledClip
+from lanestream_exporter.datasets.labels import LabeledImages
+from lanestream_exporter.datasets.manifest import DatasetCollection, LabeledClip
 from lanestream_exporter.datasets.splits import Split
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
 from lanestream_exporter.evaluation.lateral import lateral_figures
 from lanestream_exporter.evaluation.methods import Method
-from lanestream_exporter.evaluation.outcomes import FrameOutcome
+from lanestream_exporter.evaluation.outcomes import FrameEvaluation
 from lanestream_exporter.evaluation.steadiness import steadiness
 
 SCHEMA = 2
@@ -32,8 +32,8 @@ class EvaluationSet:
     """What is evaluated on: single labeled images, read again at each call of `images`, and labeled clips."""
 
     name: str
-    images: Callable[[], LabelledImages]
-    clips: tuple[LabelledClip, ...] = ()
+    images: Callable[[], LabeledImages]
+    clips: tuple[LabeledClip, ...] = ()
 
     def __post_init__(self) -> None:
         names = [clip.name for clip in self.clips]
@@ -52,8 +52,8 @@ class ClipRun:
     """One method's results on a clip: every frame in order, and the labeled frames with and without tracking."""
 
     reported: list[tuple[ReportedBoundary, ...]] = field(default_factory=list)
-    tracked: list[FrameOutcome] = field(default_factory=list)
-    alone: list[FrameOutcome] = field(default_factory=list)
+    tracked: list[FrameEvaluation] = field(default_factory=list)
+    alone: list[FrameEvaluation] = field(default_factory=list)
     size: tuple[int, int] = (1, 1)
 
     def figures(self) -> dict[str, Any]:
@@ -71,7 +71,7 @@ class Evaluation:
 
     evaluation_set: EvaluationSet
     methods: tuple[Method, ...]
-    images: dict[str, list[FrameOutcome]]
+    images: dict[str, list[FrameEvaluation]]
     clips: dict[str, dict[str, ClipRun]]
 
     def figures(self) -> dict[str, Any]:
@@ -98,7 +98,7 @@ class Evaluation:
         return {**figures, OVERALL: {"tracked": boundary_figures(tracked), "alone": boundary_figures(alone)}}
 
 
-def image_figures(method: Method, outcomes: Sequence[FrameOutcome]) -> dict[str, Any]:
+def image_figures(method: Method, outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns all figure groups of a method on single images. A new group is one more entry here."""
     figures: dict[str, Any] = {
         "boundaries": boundary_figures(outcomes),
@@ -110,9 +110,9 @@ def image_figures(method: Method, outcomes: Sequence[FrameOutcome]) -> dict[str,
     return figures
 
 
-def by_drive(outcomes: Sequence[FrameOutcome]) -> dict[str, list[FrameOutcome]]:
+def by_drive(outcomes: Sequence[FrameEvaluation]) -> dict[str, list[FrameEvaluation]]:
     """Returns the outcomes of each drive, and all of them together as `overall`."""
-    drives: dict[str, list[FrameOutcome]] = {}
+    drives: dict[str, list[FrameEvaluation]] = {}
     for outcome in outcomes:
         drives.setdefault(outcome.frame.group, []).append(outcome)
     return {**drives, OVERALL: list(outcomes)}
@@ -125,7 +125,7 @@ def run_evaluation(
 
     Raises LabelError and SourceError if the frames can't be read, and LabelError if none is labeled.
     """
-    images: dict[str, list[FrameOutcome]] = {method.name: [] for method in methods}
+    images: dict[str, list[FrameEvaluation]] = {method.name: [] for method in methods}
     report("single images")
     for frame, image in evaluation_set.images():
         for method in methods:
@@ -140,7 +140,7 @@ def run_evaluation(
     return Evaluation(evaluation_set, tuple(methods), images, clips)
 
 
-def _track(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]:
+def _track(methods: Sequence[Method], clip: LabeledClip) -> dict[str, ClipRun]:
     runs = {method.name: ClipRun() for method in methods}
     trackers = {method.name: method.start_clip() for method in methods}
     for index, image, timestamp in _decoded(clip.video, clip.frames):
@@ -149,9 +149,9 @@ def _track(methods: Sequence[Method], clip: LabelledClip) -> dict[str, ClipRun]:
             found = trackers[method.name](image, timestamp)
             run.reported.append(found)
             run.size = (image.shape[1], image.shape[0])
-            if index in clip.labelled:
-                run.tracked.append(FrameOutcome(clip.labelled[index], found))
-                run.alone.append(method.detect(image, clip.labelled[index]))
+            if index in clip.labeled:
+                run.tracked.append(FrameEvaluation(clip.labeled[index], found))
+                run.alone.append(method.detect(image, clip.labeled[index]))
     return runs
 
 

@@ -16,9 +16,9 @@ from lanestream.detection.proposals import MOST_CANDIDATES
 from lanestream.engine import Engine
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.labels import LabelledFrame, to_working
+from lanestream_exporter.datasets.labels import LabeledFrame, to_working
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
-from lanestream_exporter.evaluation.outcomes import MOST_RANKED, FrameOutcome, JudgedCandidates, judge
+from lanestream_exporter.evaluation.outcomes import MOST_RANKED, FrameEvaluation, JudgedCandidates, judge
 
 # Takes the frames of a clip in order, each with its time in seconds, and returns the boundaries of each.
 ClipTracker = Callable[[Image, float], tuple[ReportedBoundary, ...]]
@@ -47,7 +47,7 @@ class Method(Protocol):
         """Returns the name of the regressor that gives a classifier its ego-lane prior; None without one."""
         ...
 
-    def detect(self, image: Image, frame: LabelledFrame) -> FrameOutcome:
+    def detect(self, image: Image, frame: LabeledFrame) -> FrameEvaluation:
         """Evaluates a single BGR image (H, W, 3)."""
         ...
 
@@ -70,13 +70,13 @@ class ServedModel:
         has_prior = self._candidates is not None and self._candidates.regressor is not None
         self.regressor = engine.models["regressor"].name if has_prior else None
 
-    def detect(self, image: Image, frame: LabelledFrame) -> FrameOutcome:
+    def detect(self, image: Image, frame: LabeledFrame) -> FrameEvaluation:
         """Evaluates a single image as the first frame of a new session."""
         reports = _reports(self._engine.process(self._engine.open_session(), image, 0.0))
         candidates = None if self._candidates is None else self._judge(self._candidates, *to_working(frame, image))
-        return FrameOutcome(frame, reports, candidates)
+        return FrameEvaluation(frame, reports, candidates)
 
-    def _judge(self, detector: CandidateDetector, frame: LabelledFrame, image: Image) -> JudgedCandidates:
+    def _judge(self, detector: CandidateDetector, frame: LabeledFrame, image: Image) -> JudgedCandidates:
         """Judges the candidates of a working image: the same search as in `detect`, with more results."""
         proposals = detector.propose(image, paint_gray(image), FrameContext(), self._infer, MOST_RANKED)
         patches = cut_patches(image, proposals.curves, proposals.spans, proposals.view, detector.patch)
@@ -115,9 +115,9 @@ class Baseline:
         self._detector = detector
         self.name = detector.name
 
-    def detect(self, image: Image, frame: LabelledFrame) -> FrameOutcome:
+    def detect(self, image: Image, frame: LabeledFrame) -> FrameEvaluation:
         """Evaluates a single image."""
-        return FrameOutcome(frame, self._detector.detect(image))
+        return FrameEvaluation(frame, self._detector.detect(image))
 
     def start_clip(self) -> ClipTracker:
         """Returns the detector itself, without state."""

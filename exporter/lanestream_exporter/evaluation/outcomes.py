@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection.candidate_detector import BOUNDARY, CandidateDetector
 from lanestream.detection.proposals import Proposals
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_sides
 from lanestream_exporter.samples.patches import TruthRule
 
@@ -41,22 +41,22 @@ class JudgedCandidates:
 
 
 @dataclass(frozen=True)
-class FrameOutcome:
+class FrameEvaluation:
     """A labeled frame, the boundaries that a method reported for it and, for a classifier, its candidates."""
 
-    frame: LabelledFrame
+    frame: LabeledFrame
     reports: tuple[ReportedBoundary, ...]
     candidates: JudgedCandidates | None = None
 
 
-def ego_pair(outcome: FrameOutcome) -> FrameOutcome:
+def ego_pair(outcome: FrameEvaluation) -> FrameEvaluation:
     """Returns the same frame with only the labels and reports of the ego lane's boundaries."""
     lanes = tuple(lane for lane in ego_sides(outcome.frame) if lane is not None)
     reports = tuple(report for report in outcome.reports if abs(report.position) == 1)
-    return FrameOutcome(replace(outcome.frame, lanes=lanes), reports)
+    return FrameEvaluation(replace(outcome.frame, lanes=lanes), reports)
 
 
-def judge(proposals: Proposals, outputs: NDArray[np.float32], frame: LabelledFrame) -> JudgedCandidates:
+def judge(proposals: Proposals, outputs: NDArray[np.float32], frame: LabeledFrame) -> JudgedCandidates:
     """Judges up to 32 candidates against the labels of `frame`, all in pixels of the working image.
 
     `outputs` (M, 2) are the classifier's for the first M, which are those that it sees in service.

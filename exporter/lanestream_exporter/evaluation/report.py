@@ -25,7 +25,7 @@ from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.candidates import clear_candidates
 from lanestream_exporter.evaluation.figures import match_all
 from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, by_drive
-from lanestream_exporter.evaluation.outcomes import RULES, FrameOutcome
+from lanestream_exporter.evaluation.outcomes import RULES, FrameEvaluation
 
 CHART_RULE = "far_40"
 GALLERY_FRAMES = 24
@@ -85,7 +85,7 @@ def charts(evaluation: Evaluation, figures: Mapping[str, Any]) -> list[Chart]:
     return [*result, _chart(caption, lambda axes: _draw_depth(axes, images))]
 
 
-def _candidate_charts(name: str, outcomes: Sequence[FrameOutcome], drives: Mapping[str, Any]) -> Iterator[Chart]:
+def _candidate_charts(name: str, outcomes: Sequence[FrameEvaluation], drives: Mapping[str, Any]) -> Iterator[Chart]:
     judged = drives[OVERALL]["candidates"][CHART_RULE]
     yield _chart(f"{name}: precision and recall of candidates, by drive", lambda axes: _draw_curves(axes, outcomes))
     yield _chart(
@@ -99,7 +99,7 @@ def _candidate_charts(name: str, outcomes: Sequence[FrameOutcome], drives: Mappi
     yield _chart(f"{name}: proposal recall by number of candidates", lambda axes: _draw_proposals(axes, drives))
 
 
-def _draw_curves(axes: Axes, outcomes: Sequence[FrameOutcome]) -> None:
+def _draw_curves(axes: Axes, outcomes: Sequence[FrameEvaluation]) -> None:
     for drive, part in by_drive(outcomes).items():
         truth, probability = clear_candidates(part, CHART_RULE)
         if truth.any():
@@ -166,7 +166,7 @@ class GalleryImage:
     url: str = field(repr=False)
 
 
-def gallery(dataset: EvaluationSet, outcomes: Sequence[FrameOutcome]) -> list[GalleryImage]:
+def gallery(dataset: EvaluationSet, outcomes: Sequence[FrameEvaluation]) -> list[GalleryImage]:
     """Draws the worst frames, worst first. Reads the images again, so that the evaluation need not keep them."""
     worst = sorted(range(len(outcomes)), key=lambda i: _badness(outcomes[i]), reverse=True)[:GALLERY_FRAMES]
     rank_of = {index: rank for rank, index in enumerate(worst)}
@@ -177,14 +177,14 @@ def gallery(dataset: EvaluationSet, outcomes: Sequence[FrameOutcome]) -> list[Ga
     return [images[rank] for rank in sorted(images)]
 
 
-def _badness(outcome: FrameOutcome) -> tuple[int, int, float]:
+def _badness(outcome: FrameEvaluation) -> tuple[int, int, float]:
     """Returns a sort key: mistakes of the ego pair, then of all boundaries, then the mean error."""
     ego, every = match_ego(outcome.reports, outcome.frame), match_all(outcome)
     error = float(np.mean([match.error for match in every.matches])) if every.matches else 0.0
     return ego.missed + ego.wrong, every.missed + every.wrong, error
 
 
-def _gallery_image(image: Image, outcome: FrameOutcome) -> GalleryImage:
+def _gallery_image(image: Image, outcome: FrameEvaluation) -> GalleryImage:
     frame = outcome.frame
     scale = _GALLERY_WIDTH / frame.width
     size = _GALLERY_WIDTH, round(frame.height * scale)

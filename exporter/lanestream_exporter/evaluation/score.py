@@ -58,7 +58,7 @@ class BoundaryCounts:
         return {**counts, **{name: None if np.isnan(value) else value for name, value in figures.items()}}
 
 
-def score(results: Path, labels: Path) -> dict[str, Any]:
+def score_results(results: Path, labels: Path) -> dict[str, Any]:
     """Returns the level B figures of the messages in `results` at the frames labeled in `labels`.
 
     All labels of a frame without a message count as missed. Raises SourceError and LabelError, which name the file and
@@ -75,7 +75,7 @@ def score(results: Path, labels: Path) -> dict[str, Any]:
     return {
         "frames": len(messages),
         "both_ego": round(both / max(len(messages), 1), 4),
-        "labelled_frames": len(labeled),
+        "labeled_frames": len(labeled),
         "ego": ego.summary(),
         "all": every.summary(),
     }

@@ -9,14 +9,14 @@ import numpy as np
 
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, match_ego
-from lanestream_exporter.evaluation.outcomes import FrameOutcome
+from lanestream_exporter.evaluation.outcomes import FrameEvaluation
 
 # The rows, as shares of the height, at which jitter is measured; they show road with any typical camera.
 _ROWS = np.array([0.7, 0.8, 0.9])
 
 
 def steadiness(
-    reported: Sequence[tuple[ReportedBoundary, ...]], labeled: Sequence[FrameOutcome], size: tuple[int, int]
+    reported: Sequence[tuple[ReportedBoundary, ...]], labeled: Sequence[FrameEvaluation], size: tuple[int, int]
 ) -> dict[str, Any]:
     """Returns the figures of a clip of `size` (width, height).
 
@@ -53,7 +53,7 @@ def _second_differences(
     return result
 
 
-def _id_switches(labeled: Sequence[FrameOutcome]) -> int | None:
+def _id_switches(labeled: Sequence[FrameEvaluation]) -> int | None:
     """Returns how often the track id matched to a labeled ego boundary changes; None without ids.
 
     A boundary is identified by the lane id of its label.

@@ -19,7 +19,7 @@ _DECISIONS = (*_CANDIDATES, "ego prop.", "all prop.")
 _BOUNDARIES = ("ego P", "ego R", "ego F1", "px", "all P", "all R", "all F1")
 
 
-def tables(figures: Mapping[str, Any]) -> Iterator[Table]:
+def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     """Yields the tables of each level, with a section per drive and a row per method."""
     images, clips = figures["images"], figures["clips"]
     yield _table("A. Candidates, by the classifier's probability: false beyond 40 px", _CANDIDATES, images, _candidates)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from lanestream.road.view import Image
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledImages
+from lanestream_exporter.datasets.labels import LabeledFrame, LabeledImages
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.samples.road_frames import RoadFrame, road_frames
 from lanestream_exporter.scenes import render_still, sample_scene
@@ -31,7 +31,7 @@ class LabeledJpeg:
     """A frame as a client would send it, with its labels."""
 
     jpeg: bytes
-    labels: LabelledFrame
+    labels: LabeledFrame
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ class ExportFrames:
         real = _evenly_spaced(road_frames(self._real(part)), self.real)
         return [*real, *(frame for frame in rendered if frame is not None)]
 
-    def _real(self, part: Part) -> LabelledImages:
+    def _real(self, part: Part) -> LabeledImages:
         return iter(()) if self.datasets is None else self.datasets.frames(part)
 
-    def _rendered(self, part: Part) -> Iterator[tuple[LabelledFrame, Image, float]]:
+    def _rendered(self, part: Part) -> Iterator[tuple[LabeledFrame, Image, float]]:
         for index in range(self.rendered):
             rng = np.random.default_rng([_SEED, 0 if part == "train" else 1, index])
             still = render_still(sample_scene(rng, *_SIZES[index % len(_SIZES)]))

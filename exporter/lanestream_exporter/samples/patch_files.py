@@ -17,7 +17,7 @@ from lanestream.detection.proposals import MOST_CANDIDATES
 from lanestream.errors import LabelError
 from lanestream.road.crops import PatchGeometry
 from lanestream.road.view import RoadView, Scaling
-from lanestream_exporter.datasets.labels import LabelledImages, to_working
+from lanestream_exporter.datasets.labels import LabeledImages, to_working
 from lanestream_exporter.samples.cache import SAMPLES_VERSION, scene_files
 from lanestream_exporter.samples.patches import PatchMaker
 from lanestream_exporter.samples.prior_regressor import PriorRegressor, load_prior_regressor
@@ -107,7 +107,7 @@ class PatchCache:
         write = partial(_write_rendered, self.size, self.regressor)
         return scene_files(self.folder, f"rendered-{self._kind}", scenes, write, workers, done)
 
-    def labelled(self, name: str, frames: Callable[[], LabelledImages], to_train: bool) -> Path:
+    def labeled(self, name: str, frames: Callable[[], LabeledImages], to_train: bool) -> Path:
         """Returns the file `name` of patches of labeled frames; writes it if missing.
 
         Patches are cut from the proposed candidates; for training also from jittered labels, several times. Raises
@@ -118,7 +118,7 @@ class PatchCache:
             self.folder.mkdir(parents=True, exist_ok=True)
             limit = _MOST_TO_TRAIN if to_train else MOST_CANDIDATES
             maker = PatchMaker(PatchGeometry(self.size), _prior_or_none(self.regressor), limit)
-            write_store(path, _labelled_patches(maker, frames(), to_train))
+            write_store(path, _labeled_patches(maker, frames(), to_train))
         return path
 
     @property
@@ -149,8 +149,8 @@ def _rendered_patches(maker: PatchMaker, number: int, scenes: int) -> Iterator[t
         yield from maker.all_of(image, labels, RoadView(labels.width, labels.height, horizon), rng)
 
 
-def _labelled_patches(
-    maker: PatchMaker, frames: LabelledImages, to_train: bool
+def _labeled_patches(
+    maker: PatchMaker, frames: LabeledImages, to_train: bool
 ) -> Iterator[tuple[NDArray[np.uint8], int]]:
     clear = partial(filter, lambda item: item[1] in (0, 1))
     for number, (frame, image) in enumerate(itertools.starmap(to_working, frames)):

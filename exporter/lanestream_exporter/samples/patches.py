@@ -20,7 +20,7 @@ from lanestream.detection.proposals import MOST_CANDIDATES, Proposals
 from lanestream.road.crops import PatchGeometry
 from lanestream.road.curve import Curve, Curves, FloatArray
 from lanestream.road.view import Image, RoadView, Spans, visible_rows, visible_spans
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledLane, fitted_curve
+from lanestream_exporter.datasets.labels import LabeledFrame, LabeledLane, fitted_curve
 from lanestream_exporter.samples.prior_regressor import PriorRegressor, no_regressor
 
 FALSE, TRUE, UNSURE, UNKNOWN = 0, 1, 2, 3
@@ -44,7 +44,7 @@ class TruthRule:
     far: float = 30.0
     overlap: float = 0.6
 
-    def judge(self, curves: Curves, spans: Spans, view: RoadView, frame: LabelledFrame) -> NDArray[np.int64]:
+    def judge(self, curves: Curves, spans: Spans, view: RoadView, frame: LabeledFrame) -> NDArray[np.int64]:
         """Returns FALSE, TRUE, UNSURE or UNKNOWN for each candidate (N,), given in pixels of `frame`."""
         verdicts = np.where(_beyond_labels(curves, spans, frame), UNKNOWN, FALSE)
         measured = [_distances(curves, spans, view, lane, frame.width) for lane in frame.lanes]
@@ -54,15 +54,13 @@ class TruthRule:
             verdicts[(distance <= self.near) & (covered >= self.overlap)] = TRUE
         return verdicts
 
-    def follows(
-        self, curves: Curves, spans: Spans, view: RoadView, lane: LabelledLane, width: int
-    ) -> NDArray[np.bool_]:
+    def follows(self, curves: Curves, spans: Spans, view: RoadView, lane: LabeledLane, width: int) -> NDArray[np.bool_]:
         """Returns which candidates (N,) are true to the label `lane` of a frame `width` pixels wide."""
         distance, covered = _distances(curves, spans, view, lane, width)
         return (distance <= self.near) & (covered >= self.overlap)
 
 
-def columns_at(lane: LabelledLane, rows: FloatArray) -> FloatArray:
+def columns_at(lane: LabeledLane, rows: FloatArray) -> FloatArray:
     """Returns the columns of a label at `rows`, in their shape; NaN outside its extent."""
     order = np.argsort(lane.points[:, 1], kind="stable")
     y, x = lane.points[order, 1], lane.points[order, 0]
@@ -70,7 +68,7 @@ def columns_at(lane: LabelledLane, rows: FloatArray) -> FloatArray:
 
 
 def _distances(
-    curves: Curves, spans: Spans, view: RoadView, lane: LabelledLane, width: int
+    curves: Curves, spans: Spans, view: RoadView, lane: LabeledLane, width: int
 ) -> tuple[FloatArray, FloatArray]:
     """Returns the mean distances (N,) of candidates from a label, and the shares (N,) of its rows that they cover.
 
@@ -88,7 +86,7 @@ def _distances(
     return np.where(number > 0, mean * 1280.0 / width, np.inf), number / len(rows)
 
 
-def _beyond_labels(curves: Curves, spans: Spans, frame: LabelledFrame) -> NDArray[np.bool_]:
+def _beyond_labels(curves: Curves, spans: Spans, frame: LabeledFrame) -> NDArray[np.bool_]:
     """Returns whether half of each candidate (N,) lies outside the outermost label on an open side."""
     rows = spans.top[:, None] + (spans.bottom - spans.top)[:, None] * np.linspace(0.0, 1.0, 16)
     columns = curves.x(rows)
@@ -104,7 +102,7 @@ def _beyond_labels(curves: Curves, spans: Spans, frame: LabelledFrame) -> NDArra
     return beyond
 
 
-def fitted_candidate(lane: LabelledLane, view: RoadView) -> Curve | None:
+def fitted_candidate(lane: LabeledLane, view: RoadView) -> Curve | None:
     """Returns the best curve through a label under the view's horizon; None if too little of it is in view."""
     points = lane.points[lane.points[:, 1] > view.row_at(_FARTHEST_LABEL)]
     if len(points) < 3:
@@ -132,11 +130,11 @@ class PatchMaker:
         """Returns the candidates of a BGR working image with an unknown horizon, as of a stream's first frame."""
         return self._detector.propose(image, paint_gray(image), FrameContext(), self._infer, self._limit)
 
-    def proposed(self, image: Image, frame: LabelledFrame, proposals: Proposals) -> Patches:
+    def proposed(self, image: Image, frame: LabeledFrame, proposals: Proposals) -> Patches:
         """Returns patches (N, size, size, 3) of the proposed candidates, and the verdict on each (N,)."""
-        return self._labelled(image, frame, proposals.curves, proposals.spans, proposals.view)
+        return self._labeled(image, frame, proposals.curves, proposals.spans, proposals.view)
 
-    def jittered(self, image: Image, frame: LabelledFrame, view: RoadView, rng: np.random.Generator) -> Patches:
+    def jittered(self, image: Image, frame: LabeledFrame, view: RoadView, rng: np.random.Generator) -> Patches:
         """Returns patches near each label, as close as good candidates and too far off, and the verdict on each."""
         curves = [
             _shifted(fitted, view, shift)
@@ -146,10 +144,10 @@ class PatchMaker:
         ]
         batch = Curves.of(curves) if curves else Curves.none(view.horizon)
         spans = visible_spans(batch, view)
-        return self._labelled(image, frame, batch.take(spans.visible), spans.take(spans.visible), view)
+        return self._labeled(image, frame, batch.take(spans.visible), spans.take(spans.visible), view)
 
     def all_of(
-        self, image: Image, frame: LabelledFrame, view: RoadView, rng: np.random.Generator
+        self, image: Image, frame: LabeledFrame, view: RoadView, rng: np.random.Generator
     ) -> Iterator[tuple[NDArray[np.uint8], int]]:
         """Yields the patches of a frame, proposed and jittered, that are clearly true or false."""
         proposed = self.proposed(image, frame, self.propose(image))
@@ -158,7 +156,7 @@ class PatchMaker:
                 if verdict in (FALSE, TRUE):
                     yield patch, int(verdict)
 
-    def _labelled(self, image: Image, frame: LabelledFrame, curves: Curves, spans: Spans, view: RoadView) -> Patches:
+    def _labeled(self, image: Image, frame: LabeledFrame, curves: Curves, spans: Spans, view: RoadView) -> Patches:
         verdicts = TruthRule().judge(curves, spans, view, frame)
         return cut_patches(image, curves, spans, view, self._detector.patch), verdicts
 

@@ -16,7 +16,7 @@ from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import FloatArray
 from lanestream.road.view import WORKING_WIDTH, Image, Scaling
 from lanestream_exporter.datasets.horizons import shared_horizon
-from lanestream_exporter.datasets.labels import LabelledFrame, LabelledImages, LabelledLane
+from lanestream_exporter.datasets.labels import LabeledFrame, LabeledImages, LabeledLane
 from lanestream_exporter.samples.cache import scene_files
 from lanestream_exporter.scenes import render_still, sample_scene
 
@@ -48,7 +48,7 @@ class RoadFrame:
         return np.asarray(cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
 
     @classmethod
-    def of(cls, frame: LabelledFrame, image: Image, expected_horizon: float | None = None) -> RoadFrame | None:
+    def of(cls, frame: LabeledFrame, image: Image, expected_horizon: float | None = None) -> RoadFrame | None:
         """Returns a labeled frame made small; None if its labels don't determine a horizon and none is expected."""
         scaling = Scaling(min(1.0, _DETAIL_WIDTH / frame.width))
         lanes = tuple(scaling.to_working(lane.points) for lane in frame.lanes if len(lane.points) >= 3)
@@ -71,10 +71,10 @@ def rendered_frames(folder: Path, scenes: Sequence[int], workers: int, done: Cal
     return scene_files(folder, "frames", scenes, _render_file, workers, done)
 
 
-def road_frames(labelled: LabelledImages) -> list[RoadFrame]:
+def road_frames(labeled: LabeledImages) -> list[RoadFrame]:
     """Returns labeled frames made small. Frames with a single boundary get about their drive's horizon."""
-    drives: dict[str, list[tuple[LabelledFrame, Image]]] = {}
-    for frame, image in labelled:
+    drives: dict[str, list[tuple[LabeledFrame, Image]]] = {}
+    for frame, image in labeled:
         drives.setdefault(frame.group, []).append((frame, image))
     frames = []
     for drive in drives.values():
@@ -141,9 +141,9 @@ def _rendered(number: int, scenes: int) -> Iterator[RoadFrame]:
             yield frame
 
 
-def _without_far_lanes(frame: LabelledFrame) -> LabelledFrame:
+def _without_far_lanes(frame: LabeledFrame) -> LabeledFrame:
     """Returns the labels without boundaries beyond the neighboring lanes."""
-    lanes: tuple[LabelledLane, ...] = tuple(
+    lanes: tuple[LabeledLane, ...] = tuple(
         lane for lane in frame.lanes if lane.position is None or abs(lane.position) <= 2
     )
     return replace(frame, lanes=lanes)

@@ -24,7 +24,7 @@ from lanestream_exporter.scenes.scene import STYLES, Weather, compose_scene, sam
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lanestream_exporter.datasets.labels import LabelledFrame
+    from lanestream_exporter.datasets.labels import LabeledFrame
     from lanestream_exporter.scenes.layout import RoadStyle
     from lanestream_exporter.scenes.scene import Scene
     from lanestream_exporter.scenes.traffic import Vehicle
@@ -190,7 +190,7 @@ def write_clip(clip: Clip, video: Path, labels: Path, progress: ProgressCallback
         container.mux(stream.encode(None))
 
 
-def label_record(labels: LabelledFrame, clip: str, frame: int) -> dict[str, Any]:
+def label_record(labels: LabeledFrame, clip: str, frame: int) -> dict[str, Any]:
     """Returns the labels of one frame as a record of the clip's label file."""
     return {
         "clip": clip,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import WHOLE, LabeledFrame, LabeledLane
 from lanestream_exporter.scenes.backdrop import draw_backdrop
 from lanestream_exporter.scenes.lens import develop
 from lanestream_exporter.scenes.light import haze_ground, light_ground
@@ -40,7 +40,7 @@ class RenderedFrame:
     """A rendered image and its ground truth."""
 
     image: Image  # (H, W, 3) uint8, blue, green, red
-    labels: LabelledFrame
+    labels: LabeledFrame
     horizon: float  # image row of the road plane's vanishing line, pixels
     timestamp: float = 0.0  # seconds since the start of the clip
 
@@ -110,7 +110,7 @@ def _reflect(target: RenderTarget, grid: GroundGrid, wetness: float) -> None:
     region[...] = np.clip(region * (1.0 - 0.5 * fade) + smeared * fade, 0.0, 255.0).astype(np.uint8)
 
 
-def annotate(scene: Scene, projection: RoadProjection, hidden: Image) -> LabelledFrame:
+def annotate(scene: Scene, projection: RoadProjection, hidden: Image) -> LabeledFrame:
     """Returns the labels of a frame. `hidden` (H, W) is non-zero where walls, trees or houses hide the road."""
     camera = scene.camera
     rows = _rows(scene, projection)
@@ -121,8 +121,8 @@ def annotate(scene: Scene, projection: RoadProjection, hidden: Image) -> Labelle
         if len(points) < 3 or points[0, 1] - points[-1, 1] < MIN_LABEL_SPAN * camera.height:
             continue
         color = boundary.marking.color if boundary.marking else None
-        lanes.append(LabelledLane(points, lane_id, position, boundary.kind, color))
-    return LabelledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, WHOLE)
+        lanes.append(LabeledLane(points, lane_id, position, boundary.kind, color))
+    return LabeledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, WHOLE)
 
 
 def _rows(scene: Scene, projection: RoadProjection) -> FloatArray:

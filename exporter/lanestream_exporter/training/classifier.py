@@ -22,7 +22,7 @@ from lanestream_exporter.training.loop import SELECTED_BY, Batch, autocast
 
 
 class ClassifierTask:
-    """Trains `network` to tell true candidates from false ones, on a rendered or a real source, or on both.
+    """Trains `network` to separate true candidates from false ones, on a rendered or a real source, or on both.
 
     `origin` is recorded with the run: where the patches came from.
     """

@@ -92,10 +92,10 @@ def patch_files(
     files: list[PatchFiles] = []
     if datasets is not None:
         key, stride = datasets.fingerprint(), data.propagation_stride
-        train = cache.labelled(
+        train = cache.labeled(
             f"real-train-{key}-{stride}", lambda: datasets.training_frames(data.propagation), to_train=True
         )
-        check = cache.labelled(f"real-val-{key}", lambda: datasets.frames("val"), to_train=False)
+        check = cache.labeled(f"real-val-{key}", lambda: datasets.frames("val"), to_train=False)
         files.append(PatchFiles("real", (train,), (check,)))
     if data.rendered_scenes:
         # The first file validates; the scenes of the others are trained on.

@@ -38,7 +38,7 @@ from labelfiles import (
 
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.labels import checked_points
-from lanestream_exporter.datasets.reading import LabelledSample, scan_dataset
+from lanestream_exporter.datasets.reading import LabeledSample, scan_dataset
 
 
 def only_fault(path: Path, format_name: str = "auto") -> str:
@@ -110,7 +110,7 @@ def test_every_fault_is_reported_and_sound_records_are_still_read(tmp_path: Path
     worst = clip_record(image="a.jpg", width=300, lanes=[{"points": []}, {"points": [[0, 0]]}, {"points": LEFT}])
     write_lines(tmp_path / "labels.jsonl", "{", worst, "[]", clip_record(image="b.jpg"))
     found = list(scan_dataset(tmp_path))
-    assert [isinstance(one, LabelledSample) for one in found] == [False] * 5 + [True]
+    assert [isinstance(one, LabeledSample) for one in found] == [False] * 5 + [True]
     assert [str(one).split(".jsonl:")[1][0] for one in found[:-1]] == ["1", "2", "2", "2", "3"]
 
 

@@ -13,7 +13,7 @@ from labelfiles import write_manifest
 from lanestream.errors import SourceError
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
-from lanestream_exporter.datasets.labels import PARTIAL, WHOLE, LabelledFrame
+from lanestream_exporter.datasets.labels import PARTIAL, WHOLE, LabeledFrame
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.samples.patches import columns_at
 from lanestream_exporter.scenes import Drive, sample_clip, write_clip
@@ -31,18 +31,18 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def ego_only(frame: LabelledFrame) -> LabelledFrame:
+def ego_only(frame: LabeledFrame) -> LabeledFrame:
     return replace(frame, lanes=tuple(lane for lane in frame.lanes if lane.position in EGO))
 
 
-def key_frames(clip: Path) -> tuple[dict[int, LabelledFrame], dict[int, LabelledFrame]]:
+def key_frames(clip: Path) -> tuple[dict[int, LabeledFrame], dict[int, LabeledFrame]]:
     """Returns the ego lane's labels of the first and the last frame, and of all frames."""
     labels = {index: ego_only(frame) for index, frame in read_clip_labels(clip / "drive.jsonl", WHOLE).items()}
     return {index: labels[index] for index in (0, LAST)}, labels
 
 
-def propagated(clip: Path, labelled: Mapping[int, LabelledFrame], stride: int = 4) -> list[LabelledFrame]:
-    return [frame for frame, _ in LabelPropagation(stride).frames(clip / "drive.mp4", labelled)]
+def propagated(clip: Path, labeled: Mapping[int, LabeledFrame], stride: int = 4) -> list[LabeledFrame]:
+    return [frame for frame, _ in LabelPropagation(stride).frames(clip / "drive.mp4", labeled)]
 
 
 def test_propagated_labels_lie_on_the_paint(clip: Path) -> None:

@@ -98,9 +98,9 @@ def test_a_video_is_cut_by_frame_numbers(tmp_path: Path, clip: Path) -> None:
     datasets = opened(tmp_path, {"name": "drive", "path": "drive.jsonl", "split": split})
     assert sources(datasets) == {"train": ["drive.mp4#0"], "val": [], "test": ["drive.mp4#2"]}
     (test,) = datasets.clips("test")
-    assert (test.name, test.video.name, test.frames, list(test.labelled)) == ("drive", "drive.mp4", range(2, 9), [2])
+    assert (test.name, test.video.name, test.frames, list(test.labeled)) == ("drive", "drive.mp4", range(2, 9), [2])
     (whole,) = opened(tmp_path, {"name": "drive", "path": "drive.jsonl", "split": "val"}).clips("val")
-    assert list(whole.labelled) == [0, 1, 2]
+    assert list(whole.labeled) == [0, 1, 2]
     assert whole.frames.stop > 100_000
     with pytest.raises(LabelError, match="the manifest puts no frames into the split 'val'"):
         datasets.require_splits("train", "val")
@@ -129,7 +129,7 @@ def test_images_of_a_video_have_its_name_and_number(tmp_path: Path, draw: Draw, 
     assert list(opened(tmp_path, spec).clips("train")) == []
     shutil.copy(clip / "drive.mp4", tmp_path)
     (found,) = opened(tmp_path, spec).clips("train")
-    assert list(found.labelled) == [2]
+    assert list(found.labeled) == [2]
 
 
 def test_coverage_comes_from_the_manifest(tmp_path: Path, draw: Draw) -> None:

@@ -35,11 +35,11 @@ from labelfiles import (
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.caltech import bezier
 from lanestream_exporter.datasets.entries import LabelEntry
-from lanestream_exporter.datasets.labels import LabelledFrame
+from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.datasets.reading import read_dataset, read_entries
 
 
-def points(frame: LabelledFrame) -> list[Points]:
+def points(frame: LabeledFrame) -> list[Points]:
     return [lane.points.tolist() for lane in frame.lanes]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lanestream.detection.proposals import Proposals
 from lanestream.road.curve import Curve, Curves
 from lanestream.road.view import RoadView, Spans
-from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabeledFrame, LabeledLane
 from lanestream_exporter.evaluation.benchmarks import (
     TUSIMPLE_ROWS,
     culane_counts,
@@ -23,7 +23,7 @@ from lanestream_exporter.evaluation.boundaries import ReportedBoundary, match, m
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
 from lanestream_exporter.evaluation.lateral import lateral_figures
-from lanestream_exporter.evaluation.outcomes import RULES, FrameOutcome, judge
+from lanestream_exporter.evaluation.outcomes import RULES, FrameEvaluation, judge
 from lanestream_exporter.evaluation.steadiness import steadiness
 
 Array = NDArray[np.float64]
@@ -33,15 +33,15 @@ def curve(b: float, v: float = 640.0) -> Curve:
     return Curve(200.0, (v, b, 0.0))
 
 
-def label(b: float, top: float = 240.0, position: int | None = None, lane_id: int | None = None) -> LabelledLane:
+def label(b: float, top: float = 240.0, position: int | None = None, lane_id: int | None = None) -> LabeledLane:
     rows = np.arange(710.0, top - 1.0, -10.0)
     x = curve(b).x(rows)
     inside = (x >= 0.0) & (x <= 1279.0)
-    return LabelledLane(np.stack([x, rows], axis=1)[inside], lane_id, position)
+    return LabeledLane(np.stack([x, rows], axis=1)[inside], lane_id, position)
 
 
-def frame(*lanes: LabelledLane, coverage: Coverage = PARTIAL, group: str = "drive", number: int = 0) -> LabelledFrame:
-    return LabelledFrame(1280, 720, lanes, group, f"{group}#{number}", coverage)
+def frame(*lanes: LabeledLane, coverage: Coverage = PARTIAL, group: str = "drive", number: int = 0) -> LabeledFrame:
+    return LabeledFrame(1280, 720, lanes, group, f"{group}#{number}", coverage)
 
 
 def report(b: float, position: int, v: float = 640.0, track_id: int | None = None) -> ReportedBoundary:
@@ -76,8 +76,8 @@ def test_an_absent_side_counts_if_the_ego_lane_is_completely_labeled() -> None:
 
 def test_boundary_figures_of_two_frames() -> None:
     outcomes = [
-        FrameOutcome(frame(*PAIR, coverage=WHOLE), (report(-1.1, -1, 650.0), report(1.1, 1))),
-        FrameOutcome(frame(*PAIR, coverage=WHOLE), (report(-1.1, -1), report(0.3, 1))),
+        FrameEvaluation(frame(*PAIR, coverage=WHOLE), (report(-1.1, -1, 650.0), report(1.1, 1))),
+        FrameEvaluation(frame(*PAIR, coverage=WHOLE), (report(-1.1, -1), report(0.3, 1))),
     ]
     ego = boundary_figures(outcomes)["ego"]
     assert (ego["right"], ego["wrong"], ego["missed"], ego["absent"]) == (3, 1, 1, 0)
@@ -95,7 +95,7 @@ def test_boundary_figures_of_two_frames() -> None:
 def test_lateral_errors_of_the_curve_and_of_its_straight_extrapolation() -> None:
     curved = Curve(200.0, (640.0, -1.1, 2000.0))
     outcomes = [
-        FrameOutcome(frame(*PAIR, number=i), (ReportedBoundary(curved, 280.0, 719.0, -1), report(1.1, 1)))
+        FrameEvaluation(frame(*PAIR, number=i), (ReportedBoundary(curved, 280.0, 719.0, -1), report(1.1, 1)))
         for i in range(2)
     ]
     near, far = (lateral_figures(outcomes)[distance] for distance in ("10m", "30m"))
@@ -109,7 +109,7 @@ def test_lateral_errors_of_the_curve_and_of_its_straight_extrapolation() -> None
 
 
 def test_figures_without_data_are_none() -> None:
-    figures = boundary_figures([FrameOutcome(frame(coverage=WHOLE), ())])
+    figures = boundary_figures([FrameEvaluation(frame(coverage=WHOLE), ())])
     assert figures["all"]["precision"] is None
     assert figures["all"]["mean_error_px_640"] is None
     assert figures["ego"]["accuracy"] == 1.0
@@ -185,7 +185,7 @@ def test_tusimple_frames_are_scaled_and_reports_extrapolated() -> None:
     wanted = frame(label(-1.1), label(1.1))
     perfect = tusimple_frame([report(-1.1, -1), report(1.1, 1)], wanted)
     assert perfect.accuracy == 1.0  # although the reports end at row 280 and the labels at 240
-    half = LabelledFrame(640, 360, tuple(LabelledLane(i.points / 2.0) for i in wanted.lanes), "d", "d#0")
+    half = LabeledFrame(640, 360, tuple(LabeledLane(i.points / 2.0) for i in wanted.lanes), "d", "d#0")
     reports = [ReportedBoundary(Curve(100.0, (320.0, b, 0.0)), 140.0, 359.0, s) for b, s in ((-1.1, -1), (1.1, 1))]
     assert tusimple_frame(reports, half) == perfect
     cut = [replace(report, farthest=300.0) for report in reports]
@@ -239,8 +239,8 @@ def test_stripes_are_matched_for_the_largest_total_overlap() -> None:
 def test_ego_pair_figures_ignore_other_boundaries() -> None:
     outer = label(3.0)
     outcomes = [
-        FrameOutcome(frame(*PAIR, outer), (report(-1.1, -1), report(1.1, 1), report(2.2, 2))),
-        FrameOutcome(frame(label(3.0, position=2)), (report(1.1, 1),)),
+        FrameEvaluation(frame(*PAIR, outer), (report(-1.1, -1), report(1.1, 1), report(2.2, 2))),
+        FrameEvaluation(frame(label(3.0, position=2)), (report(1.1, 1),)),
     ]
     figures = field_figures(outcomes)
     assert (figures["tusimple"]["frames"], figures["tusimple"]["labels"]) == (2, 4)
@@ -253,8 +253,8 @@ def test_ego_pair_figures_ignore_other_boundaries() -> None:
 
 def test_field_figures_over_a_set() -> None:
     outcomes = [
-        FrameOutcome(frame(*PAIR), (report(-1.1, -1), report(1.1, 1))),
-        FrameOutcome(frame(*PAIR), (report(-1.1, -1),)),
+        FrameEvaluation(frame(*PAIR), (report(-1.1, -1), report(1.1, 1))),
+        FrameEvaluation(frame(*PAIR), (report(-1.1, -1),)),
     ]
     figures = field_figures(outcomes)
     assert figures["tusimple"]["accuracy"] == 0.75
@@ -275,7 +275,7 @@ def test_candidates_under_both_rules() -> None:
     proposals = Proposals(Curves.of([curve(-1.1, 640.0 + v) for v in shifts]), spans, view, 1.0, None)
     outputs = np.array([[0.05, 0.95], [0.75, 0.25], [0.05, 0.95], [0.85, 0.15]], np.float32)
     judged = judge(proposals, outputs, labels)
-    figures = candidate_figures([FrameOutcome(labels, (), judged)], 0.5)
+    figures = candidate_figures([FrameEvaluation(labels, (), judged)], 0.5)
     assert figures["far_40"]["confusion"] == {"tp": 1, "fp": 0, "fn": 1, "tn": 1}
     assert (figures["far_40"]["unsure"], figures["far_30"]["unsure"]) == (1, 0)
     assert figures["far_30"]["confusion"] == {"tp": 1, "fp": 1, "fn": 1, "tn": 1}
@@ -287,11 +287,11 @@ def test_candidates_under_both_rules() -> None:
     assert figures["far_40"]["calibration"]["expected_error"] == pytest.approx((0.05 + 0.75 + 0.15) / 3, abs=1e-3)
     assert figures["decided"] == {rule: figures[rule] for rule in RULES}, "without a prior the classifier decides"
     with_prior = replace(judged, decided=np.array([0.95, 0.75, 0.95, 0.15]))
-    decided = candidate_figures([FrameOutcome(labels, (), with_prior)], 0.5)
+    decided = candidate_figures([FrameEvaluation(labels, (), with_prior)], 0.5)
     assert decided["decided"]["far_40"]["confusion"] == {"tp": 2, "fp": 0, "fn": 0, "tn": 1}
     assert decided["far_40"] == figures["far_40"]
     reverse = replace(proposals, curves=proposals.curves.take([3, 2, 1, 0]))
-    ranked = candidate_figures([FrameOutcome(labels, (), judge(reverse, outputs[:2], labels))], 0.5)
+    ranked = candidate_figures([FrameEvaluation(labels, (), judge(reverse, outputs[:2], labels))], 0.5)
     assert ranked["far_30"]["candidates"] == 2, "only those that the classifier saw are judged"
     recall = ranked["proposal_recall"]["ego"]
     assert recall["labels"] == 2
@@ -343,22 +343,22 @@ def test_steadiness_of_a_clip() -> None:
     reported = [(report(-1.1, -1, v, track_id=7), report(1.1, 1, track_id=8)) for v in jittering]
     reported[9] = (report(-1.1, -1, track_id=7),)
     labels = [label(-1.1, position=-1, lane_id=1), label(1.1, position=1, lane_id=2)]
-    labelled = [FrameOutcome(frame(*labels, number=i), reported[i]) for i in (0, 4, 8)]
-    figures = steadiness(reported, labelled, (1280, 720))
+    labeled = [FrameEvaluation(frame(*labels, number=i), reported[i]) for i in (0, 4, 8)]
+    figures = steadiness(reported, labeled, (1280, 720))
     assert (figures["frames"], figures["both_ego_frames"], figures["both_ego"]) == (10, 9, 0.9)
     # Left: second differences of plus and minus 8 px at 640 wide; right: zero.
     assert figures["jitter_samples"] == 3 * (8 + 7)
     assert figures["jitter_px_640"] == pytest.approx(8.0 * np.sqrt(8 / 15), abs=0.3)
     assert figures["id_switches"] == 0
     swapped = [
-        *labelled[:2],
-        FrameOutcome(labelled[2].frame, (report(-1.1, -1, track_id=9), report(1.1, 1, track_id=8))),
+        *labeled[:2],
+        FrameEvaluation(labeled[2].frame, (report(-1.1, -1, track_id=9), report(1.1, 1, track_id=8))),
     ]
     assert steadiness(reported, swapped, (1280, 720))["id_switches"] == 1
 
 
 def test_reports_without_track_ids_have_no_identity_switches() -> None:
     reported = [(report(-1.1, -1), report(1.1, 1))]
-    figures = steadiness(reported, [FrameOutcome(frame(*PAIR), reported[0])], (1280, 720))
+    figures = steadiness(reported, [FrameEvaluation(frame(*PAIR), reported[0])], (1280, 720))
     assert figures["id_switches"] is None
     assert figures["jitter_px_640"] is None

@@ -18,14 +18,14 @@ from lanestream.engine import load_engine
 from lanestream.errors import LabelError
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.clips import read_clip_labels
-from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame
-from lanestream_exporter.datasets.manifest import LabelledClip
+from lanestream_exporter.datasets.labels import WHOLE, LabeledFrame
+from lanestream_exporter.datasets.manifest import LabeledClip
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
 from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, ServedModel
 from lanestream_exporter.evaluation.report import write_report
-from lanestream_exporter.evaluation.tables import tables
+from lanestream_exporter.evaluation.tables import figure_tables
 from lanestream_exporter.evaluation_commands import evaluate as command
 from lanestream_exporter.scenes import Drive, render_still, sample_clip, write_clip
 
@@ -33,7 +33,7 @@ DOCUMENT = Path(__file__).parents[4] / "docs" / "evaluation.md"
 BASELINES = [HoughLinesBaseline(), SlidingWindowBaseline()]
 
 
-def still(seed: int, width: int = 640, height: int = 360) -> tuple[LabelledFrame, Image]:
+def still(seed: int, width: int = 640, height: int = 360) -> tuple[LabeledFrame, Image]:
     rng = np.random.default_rng(seed)
     drive = Drive("highway", fair=True)
     rendered = render_still(sample_clip(rng, width, height, frames=1, fps=25.0, drive=drive).scene_at(0))
@@ -75,17 +75,17 @@ def test_baselines_find_boundaries_on_some_rendered_highways(baseline: Any) -> N
 
 
 @pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> LabelledClip:
+def clip(tmp_path_factory: pytest.TempPathFactory) -> LabeledClip:
     folder = tmp_path_factory.mktemp("clip")
     rng = np.random.default_rng(24)
     made = sample_clip(rng, 320, 180, frames=8, fps=25.0, drive=Drive("highway", fair=True))
     video, labels = folder / "road.mp4", folder / "road.jsonl"
     write_clip(made, video, labels)
-    return LabelledClip("road", video, read_clip_labels(labels, WHOLE), range(1000))
+    return LabeledClip("road", video, read_clip_labels(labels, WHOLE), range(1000))
 
 
 @pytest.fixture(scope="module")
-def evaluation(clip: LabelledClip) -> Evaluation:
+def evaluation(clip: LabeledClip) -> Evaluation:
     frames = [still(seed) for seed in range(24, 28)]
     methods = [ServedModel(load_engine(provider="cpu")), *map(Baseline, BASELINES)]
     return run_evaluation(methods, EvaluationSet("rendered", lambda: iter(frames), (clip,)))
@@ -180,7 +180,7 @@ def test_the_worst_frames_come_first(evaluation: Evaluation, figures: dict[str, 
 
 
 def test_the_tables_name_every_method_and_drive(figures: dict[str, Any]) -> None:
-    made = list(tables(figures))
+    made = list(figure_tables(figures))
     drives = len(figures["images"][BASELINES[0].name])
     assert drives == 5
     assert [table.row_count for table in made] == [2 * drives, 2 * drives, 4 * drives, 8, 8, *[4 * drives] * 3]

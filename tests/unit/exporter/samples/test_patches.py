@@ -11,7 +11,7 @@ from lanestream.errors import LabelError
 from lanestream.road.curve import Curve, Curves
 from lanestream.road.view import RoadView, Scaling, Spans
 from lanestream_exporter.datasets.clips import read_clip_labels
-from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import EGO_LANE, PARTIAL, WHOLE, Coverage, LabeledFrame, LabeledLane
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_labels, match
 from lanestream_exporter.evaluation.score import BoundaryCounts
 from lanestream_exporter.samples.patch_files import read_stores, write_store
@@ -24,16 +24,16 @@ def curve(b: float, v: float = 640.0) -> Curve:
     return Curve(300.0, (v, b, 0.0))
 
 
-def label(b: float, top: float = 340.0, bottom: float = 700.0, position: int | None = None) -> LabelledLane:
+def label(b: float, top: float = 340.0, bottom: float = 700.0, position: int | None = None) -> LabeledLane:
     rows = np.linspace(bottom, top, 30)
-    return LabelledLane(np.stack([curve(b).x(rows), rows], axis=1), position=position)
+    return LabeledLane(np.stack([curve(b).x(rows), rows], axis=1), position=position)
 
 
-def frame(*lanes: LabelledLane, coverage: Coverage = PARTIAL) -> LabelledFrame:
-    return LabelledFrame(1280, 720, lanes, "clip", "clip#0", coverage)
+def frame(*lanes: LabeledLane, coverage: Coverage = PARTIAL) -> LabeledFrame:
+    return LabeledFrame(1280, 720, lanes, "clip", "clip#0", coverage)
 
 
-def judge(*curves: Curve, labels: LabelledFrame, top: float = 342.0) -> list[int]:
+def judge(*curves: Curve, labels: LabeledFrame, top: float = 342.0) -> list[int]:
     """Returns the verdicts on candidates that are visible from the row `top` down."""
     number = len(curves)
     spans = Spans(np.full(number, top), np.full(number, 719.0), np.ones(number, bool))
@@ -102,7 +102,7 @@ def test_a_short_overlap_is_not_enough_to_be_true() -> None:
 def test_a_label_becomes_the_candidate_that_follows_it() -> None:
     curved = Curve(300.0, (640.0, -1.1, 4000.0))
     rows = np.linspace(700.0, 340.0, 30)
-    fitted = fitted_candidate(LabelledLane(np.stack([curved.x(rows), rows], axis=1)), VIEW)
+    fitted = fitted_candidate(LabeledLane(np.stack([curved.x(rows), rows], axis=1)), VIEW)
     assert fitted is not None
     np.testing.assert_allclose(fitted.x(rows), curved.x(rows), atol=0.01)
 

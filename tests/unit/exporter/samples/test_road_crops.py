@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import Curve
 from lanestream.road.view import Image, RoadView
-from lanestream_exporter.datasets.labels import WHOLE, LabelledFrame, LabelledLane
+from lanestream_exporter.datasets.labels import WHOLE, LabeledFrame, LabeledLane
 from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, warped_road_crop
 from lanestream_exporter.samples.road_frames import RoadFrame, read_frames, write_frames
 
@@ -38,8 +38,8 @@ def road() -> Image:
 
 @pytest.fixture(scope="module")
 def frame() -> RoadFrame:
-    lanes = tuple(LabelledLane(points(curve)) for curve in (LEFT, RIGHT))
-    made = RoadFrame.of(LabelledFrame(WIDTH, HEIGHT, lanes, "drive", "drawn", WHOLE), road())
+    lanes = tuple(LabeledLane(points(curve)) for curve in (LEFT, RIGHT))
+    made = RoadFrame.of(LabeledFrame(WIDTH, HEIGHT, lanes, "drive", "drawn", WHOLE), road())
     assert made is not None
     return made
 

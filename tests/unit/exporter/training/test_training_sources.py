@@ -149,7 +149,7 @@ def test_with_a_regressor_candidates_are_proposed_as_served(tmp_path: Path) -> N
     np.testing.assert_array_equal(with_prior, served)
     assert not np.array_equal(alone, served)
     paths = [
-        PatchCache(tmp_path, 64, file).labelled("real", lambda: iter([(still.labels, still.image)]), to_train=False)
+        PatchCache(tmp_path, 64, file).labeled("real", lambda: iter([(still.labels, still.image)]), to_train=False)
         for file in (SHIPPED_REGRESSOR, None)
     ]
     stores = [read_stores([path]) for path in paths]
@@ -159,6 +159,6 @@ def test_with_a_regressor_candidates_are_proposed_as_served(tmp_path: Path) -> N
 
 def test_a_file_that_is_not_a_regressor_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"can't read .*gone\.onnx: no such file"):
-        PatchCache(tmp_path, 64, tmp_path / "gone.onnx").labelled("real", lambda: iter(()), to_train=False)
+        PatchCache(tmp_path, 64, tmp_path / "gone.onnx").labeled("real", lambda: iter(()), to_train=False)
     with pytest.raises(ModelError, match=r"classifier\.onnx is not a regressor"):
-        PatchCache(tmp_path, 64, SHIPPED_MODEL).labelled("real", lambda: iter(()), to_train=False)
+        PatchCache(tmp_path, 64, SHIPPED_MODEL).labeled("real", lambda: iter(()), to_train=False)
