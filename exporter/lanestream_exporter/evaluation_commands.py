@@ -21,7 +21,7 @@ from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, Sliding
 from lanestream_exporter.evaluation.measuring import EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
 from lanestream_exporter.evaluation.score import score_results
-from lanestream_exporter.evaluation.tables import tables
+from lanestream_exporter.evaluation.tables import figure_tables
 
 if TYPE_CHECKING:
     from lanestream_exporter.datasets.splits import Split
@@ -76,7 +76,7 @@ def evaluate(
     )
     figures = evaluation.figures()
     console = Console(width=max(_MIN_WIDTH, Console().width))
-    for table in tables(figures):
+    for table in figure_tables(figures):
         console.print(table)
     if out is not None:
         with needs_extra("train"), _writing(out):
