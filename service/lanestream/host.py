@@ -30,6 +30,11 @@ _RELEVANT_INSTRUCTION_SETS: Final = (
     *("asimd", "asimddp", "i8mm", "bf16", "sve"),
 )
 
+# glibc's names for the size from which memory is mapped by itself, and for the free memory that it keeps.
+_M_MMAP_THRESHOLD: Final = -3
+_M_TRIM_THRESHOLD: Final = -1
+_KEPT_BYTES: Final = 16 << 20
+
 
 @dataclass(frozen=True)
 class Cpu:
@@ -162,12 +167,6 @@ def _read_memory_max(group: Path) -> float | None:
 def _read_memory_limit(group: Path) -> float | None:
     limit = int((group / "memory.limit_in_bytes").read_text())
     return None if limit >= _UNLIMITED_BYTES else float(limit)
-
-
-# glibc's names for the size from which memory is mapped by itself, and for the free memory that it keeps.
-_M_MMAP_THRESHOLD: Final = -3
-_M_TRIM_THRESHOLD: Final = -1
-_KEPT_BYTES: Final = 16 << 20
 
 
 def keep_freed_memory() -> None:

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.curve_fit import fit_curves
+from lanestream.detection.curve_fit import USUAL_OBLIQUITY, fit_curves
 from lanestream.detection.ego_prior import RoadRegressor
 from lanestream.detection.features import paint_gray
 from lanestream.detection.interface import Detections, FrameContext, Infer
@@ -40,8 +40,6 @@ _AVERAGED: Final = 0.25
 # The prior's boundaries are fitted to the paint and become candidates too, except within this distance, in row offsets,
 # of a tracked boundary, which is on the paint already.
 _TRACKED: Final = 0.16
-# hypot(1, slope) of an ego boundary, see `curve_fit`.
-_USUAL_OBLIQUITY: Final = 1.6
 # If two boundaries come closer than this, in row offsets, or cross, one of them is wrong.
 _CLOSEST: Final = 0.8
 
@@ -126,7 +124,7 @@ def _means(
     """
     rows = view.horizon + ANCHORS * view.depth
     slope = curves.take(chosen).slope(rows[1:2])[:, 0]
-    obliquity = np.maximum(1.0, np.hypot(1.0, slope) / _USUAL_OBLIQUITY)
+    obliquity = np.maximum(1.0, np.hypot(1.0, slope) / USUAL_OBLIQUITY)
     weights = (gaps[chosen] <= _AVERAGED * obliquity[:, None]) * probability**8
     return Curves.through(view.horizon, rows, weights @ curves.x(rows) / weights.sum(axis=1, keepdims=True))
 

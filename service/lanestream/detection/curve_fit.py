@@ -24,7 +24,7 @@ from lanestream.road.view import Image, RoadView, Spans, visible_spans
 
 # hypot(1, slope) of an ego boundary half a lane of 3.6 m beside a camera 1.45 m high. Errors across the image of more
 # oblique lines are larger for the same distance on the road, so their strips and tolerances are wider.
-_USUAL_OBLIQUITY: Final = 1.6
+USUAL_OBLIQUITY: Final = 1.6
 
 # All widths are shares of the row offset, as everything on the road is. Markings are about as wide as one of these.
 _MARKING_WIDTHS: Final = (0.05, 0.1, 0.17)
@@ -125,7 +125,7 @@ class _Strips:
     ) -> _Strips:
         y = top[:, None] + (bottom - top)[:, None] * np.linspace(0.0, 1.0, rows)
         slope = curves.slope(0.5 * (top + bottom)[:, None])[:, 0]
-        obliquity = np.maximum(1.0, np.hypot(1.0, slope) / _USUAL_OBLIQUITY)
+        obliquity = np.maximum(1.0, np.hypot(1.0, slope) / USUAL_OBLIQUITY)
         across = np.linspace(-reach, reach, cells, dtype=np.float32)
         return cls(y, curves.x(y), y - view.horizon, obliquity, across)
 

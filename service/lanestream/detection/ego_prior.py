@@ -19,7 +19,7 @@ from lanestream.detection.interface import Infer
 from lanestream.images.resizing import resized
 from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import Curves, FloatArray, VanishingPoint
-from lanestream.road.view import USUAL_LANE_WIDTH, Image, RoadView, Scaling
+from lanestream.road.view import LANE_WIDTHS, USUAL_LANE_WIDTH, Image, RoadView, Scaling
 
 # The regressor gives columns at these shares of the depth below the horizon.
 REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
@@ -140,13 +140,11 @@ class LaneSpacing:
     # because lanes begin and end there.
     _TOLERANCE = 0.12
     _OUTER_WEIGHT = 0.6
-    # Limits of the lane width.
-    _WIDTHS = (1.2, 4.5)
 
     @property
     def width(self) -> float:
         """The lane width, within plausible limits."""
-        narrowest, widest = self._WIDTHS
+        narrowest, widest = LANE_WIDTHS
         return min(max(self.right - self.left, narrowest), widest)
 
     @property

@@ -78,11 +78,10 @@ def propose(
     tracked = (context.tracked or Curves.none(point.y)).below(point.y, view.bottom)
     leading = [tracked]
     if prior is not None and prior.sides:
-        own = prior.curves.below(point.y, view.bottom)
         bottom = np.array([view.bottom])
-        spacing = prior.spacing(point.places(own.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
+        spacing = prior.spacing(point.places(prior.curves.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
         strength = strength * spacing.weight(lines.places)
-        leading += [own, point.curves(spacing.neighbors)]
+        leading += [prior.curves, point.curves(spacing.neighbors)]
     if road.hough is not None:
         curves, votes = hough_curves(road.hough, point, view)
         found = Curves.concatenate([found, curves])
