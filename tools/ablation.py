@@ -23,7 +23,7 @@ import click
 import cv2
 import numpy as np
 
-from lanestream.detection import candidate_detector, curve_fit, proposals, vanishing_point
+from lanestream.detection import candidate_detector, curve_fit, ego_prior, proposals, vanishing_point
 from lanestream.detection.ego_prior import EgoPrior, LaneSpacing
 from lanestream.engine import Engine, load_engine
 from lanestream.errors import LanestreamError
@@ -33,6 +33,7 @@ from lanestream.road.curve import Curves
 from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.datasets.manifest import DatasetCollection, LabeledClip
 from lanestream_exporter.evaluation.boundaries import FrameMatches, ReportedBoundary, match, match_ego
+from lanestream_exporter.evaluation.steadiness import steadiness
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.scenes.clip import render_clip, sample_clip
 
@@ -110,6 +111,8 @@ def _without_own_boundaries(engine: Engine, stack: ExitStack) -> Engine:
 STAGES: Final[dict[str, Leave | None]] = {
     BASELINE: None,
     "ego-lane prior": _without_regressor,
+    "mirrored crop of an uncertain regressor": _replace(ego_prior, "_UNCERTAIN", np.inf),
+    "refined vanishing point": _replace(proposals, "refine", lambda guess, *_: guess),
     "lines through the vanishing point": _replace(proposals, "find_lines", _without_lines),
     "tracked boundaries as candidates": _propose(tracked=None),
     "prior's boundaries as candidates": _without_own_boundaries,
@@ -210,11 +213,12 @@ def _stream(clip: LabeledClip) -> FrameSequence:
 def run(stage: str, paths: list[Path]) -> dict[str, Any]:
     """Returns the counts of every sequence without a `stage`, and the CPU time per frame in milliseconds.
 
-    Counts are right, wrong, missed and the sum of errors (pixels at 640 wide) of ego boundaries, then of all.
+    Counts are right, wrong, missed and the sum of errors (pixels at 640 wide) of ego boundaries, then of all. Streams
+    are frames with both ego boundaries, and the number of samples of the jitter with their sum of squares.
     """
     cv2.setNumThreads(1)
     engine = load_engine(provider="cpu", options=RuntimeOptions(threads=1))
-    groups, counts, spent, frames = [], [], 0.0, 0
+    groups, counts, streams, spent, frames = [], [], [], 0.0, 0
     with ExitStack() as stack:
         leave = STAGES[stage]
         engine = engine if leave is None else leave(engine, stack)
@@ -222,19 +226,26 @@ def run(stage: str, paths: list[Path]) -> dict[str, Any]:
             for sequence in pickle.loads(path.read_bytes()):  # noqa: S301 - our own file
                 session = engine.open_session()
                 total = np.zeros(8)
+                reported: list[tuple[ReportedBoundary, ...]] = []
+                size = 1, 1
                 for index, data in enumerate(sequence.frames):
-                    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+                    image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
                     started = time.process_time()
-                    result = engine.process(session, np.asarray(image, np.uint8), index / sequence.fps)
+                    result = engine.process(session, image, index / sequence.fps)
                     spent += time.process_time() - started
                     frames += 1
+                    reports = tuple(ReportedBoundary.from_lane(lane) for lane in result.lanes)
+                    reported.append(reports)
+                    size = image.shape[1], image.shape[0]
                     label = sequence.labels.get(index)
                     if label is not None:
-                        reports = [ReportedBoundary.from_lane(lane) for lane in result.lanes]
                         total += _counts(match_ego(reports, label)) + _counts(match(reports, label.lanes, label))
                 groups.append(sequence.group)
                 counts.append(total.tolist())
-    return {"groups": groups, "counts": counts, "cpu_ms": 1e3 * spent / frames}
+                steady = steadiness(reported, (), size)
+                samples = steady["jitter_samples"]
+                streams.append([steady["both_ego_frames"], samples, samples * (steady["jitter_px_640"] or 0.0) ** 2])
+    return {"groups": groups, "counts": counts, "streams": streams, "cpu_ms": 1e3 * spent / frames}
 
 
 def _counts(matches: FrameMatches) -> list[float]:
@@ -257,9 +268,9 @@ def table(results: dict[str, dict[str, Any]], wanted: Callable[[str], bool]) -> 
     weights = np.random.default_rng(0).multinomial(number, np.full(number, 1.0 / number), 1000)
     yield (
         "| left out | ego right | wrong | missed | error, px | F1 lost | all right | wrong | missed | F1 lost | "
-        "CPU, ms |"
+        "frames with both ego boundaries | jitter, px | CPU, ms |"
     )
-    yield "| --- " * 11 + "|"
+    yield "| --- " * 13 + "|"
     reference = np.array(base["counts"])[chosen]
     for name, result in results.items():
         counts = np.array(result["counts"])[chosen]
@@ -269,7 +280,8 @@ def table(results: dict[str, dict[str, Any]], wanted: Callable[[str], bool]) -> 
             cells += [f"{right:.0f}", f"{wrong:.0f}", f"{missed:.0f}"]
             cells += [f"{error / max(right, 1.0):.2f}"] if with_error else []
             cells.append("" if name == BASELINE else _loss(reference[:, part], counts[:, part], weights))
-        cells.append(f"{result['cpu_ms']:.1f}")
+        both, samples, squares = np.array(result["streams"])[chosen].sum(axis=0)
+        cells += [f"{both:.0f}", f"{np.sqrt(squares / max(samples, 1.0)):.2f}", f"{result['cpu_ms']:.1f}"]
         yield "| " + " | ".join(cells) + " |"
 
 

@@ -73,7 +73,7 @@ def _split(value: object) -> list[str]:
 def _provider(name: str) -> str:
     """Returns the name of an execution provider, or `auto`. Raises ValueError for any other."""
     if name not in PROVIDER_NAMES:
-        raise ValueError(f"{name!r} is not a provider; {', '.join(PROVIDER_NAMES)} are accepted")
+        raise ValueError(f"input should be one of {', '.join(PROVIDER_NAMES)}")
     return name
 
 

@@ -27,8 +27,9 @@ REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
 # Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each.
 UNKNOWN_HORIZONS: Final = (0.32, 0.39, 0.46, 0.53, 0.6)
 
-# A boundary whose mean sigma, in image widths, is above this is not used for the search: the network does not know such
-# roads.
+# If the mean sigma, in image widths, is above the first limit, the network also runs on the mirrored crop. A boundary
+# whose sigma is above the second limit is not used for the search: the network does not know such roads.
+_UNCERTAIN: Final = 0.022
 _MOST_UNCERTAIN: Final = 0.1
 # Lateral positions are compared at these anchors: farther away all lines of a road are close together.
 _COMPARED: Final = REGRESSOR_ANCHORS[:2]
@@ -65,6 +66,20 @@ class RegressorOutput:
     def uncertainty(self) -> float:
         """The mean standard deviation, plus a little for a horizon that is not where the crop assumed it."""
         return float(self.sigma.mean() + 0.05 * abs(self.horizon))
+
+    @property
+    def mirrored(self) -> RegressorOutput:
+        """The output of a mirrored crop, mirrored back."""
+        return RegressorOutput(-self.columns[::-1], self.sigma[::-1], self.presence[::-1], self.horizon)
+
+    def mean(self, other: RegressorOutput) -> RegressorOutput:
+        """Returns the mean of two outputs for one crop."""
+        return RegressorOutput(
+            0.5 * (self.columns + other.columns),
+            0.5 * (self.sigma + other.sigma),
+            0.5 * (self.presence + other.presence),
+            0.5 * (self.horizon + other.horizon),
+        )
 
     def view(self, assumed: RoadView) -> RoadView:
         """Returns the view with the horizon where the network sees it."""
@@ -189,6 +204,10 @@ class RoadRegressor:
         view = RoadView(width, height, float(np.clip(horizon, 0.0, 0.85 * height)))
         crop = self.crop(detail, view)
         output = RegressorOutput.of(infer("regressor", crop[None])[0])
+        if output.sigma.mean() > _UNCERTAIN:
+            # The network's errors differ between a crop and its mirror image, so their mean is the better estimate.
+            mirrored = RegressorOutput.of(infer("regressor", np.ascontiguousarray(crop[None, :, ::-1]))[0]).mirrored
+            output = output.mean(mirrored)
         return output, output.view(view)
 
     def crop(self, detail: Image, view: RoadView) -> NDArray[np.uint8]:

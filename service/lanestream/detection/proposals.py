@@ -15,6 +15,7 @@ from lanestream.detection.interface import FrameContext
 from lanestream.detection.marking_filter import Ridges, find_ridges
 from lanestream.detection.vanishing_point import (
     KNOWN_HORIZON,
+    NEAR_PRIOR,
     WIDE,
     find_lines,
     refine,
@@ -78,10 +79,11 @@ def propose(
     tracked = (context.tracked or Curves.none(point.y)).below(point.y, view.bottom)
     leading = [tracked]
     if prior is not None and prior.sides:
+        own = prior.curves.below(point.y, view.bottom)
         bottom = np.array([view.bottom])
-        spacing = prior.spacing(point.places(prior.curves.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
+        spacing = prior.spacing(point.places(own.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
         strength = strength * spacing.weight(lines.places)
-        leading += [prior.curves, point.curves(spacing.neighbors)]
+        leading += [own, point.curves(spacing.neighbors)]
     if road.hough is not None:
         curves, votes = hough_curves(road.hough, point, view)
         found = Curves.concatenate([found, curves])
@@ -113,7 +115,8 @@ def _search_road(gray: Image, context: FrameContext, prior: EgoPrior | None) -> 
     """Returns the vanishing point, near that of the prior, or else where the lines of the edges meet."""
     height, width = gray.shape
     if prior is not None and prior.sides:
-        return _Road(prior.vanishing_point, find_ridges(gray, prior.vanishing_point))
+        ridges = find_ridges(gray, prior.vanishing_point)
+        return _Road(refine(prior.vanishing_point, ridges, width, height - 1.0, NEAR_PRIOR), ridges)
     horizon = context.horizon
     if horizon is not None:
         # A prior without boundaries, in the dark or in a sharp curve, still gives the horizon.

@@ -108,6 +108,7 @@ class SearchRange:
 WIDE: Final = SearchRange(0.12, 0.1, 0.06, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
 # A known horizon moves only with the vehicle's pitch.
 KNOWN_HORIZON: Final = SearchRange(0.12, 0.02, 0.06, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
+NEAR_PRIOR: Final = SearchRange(0.03, 0.01, 0.015, 300, ((3, 0.7), (3, 0.35), (3, 0.12)))
 
 # The histogram on the bottom row: the width of a cell, and its reach from the middle, both in image widths.
 _CELL: Final = 0.012

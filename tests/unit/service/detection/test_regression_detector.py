@@ -65,7 +65,14 @@ class FakeRegressor:
         if len(inputs) != 1:
             assert self.looks is not None
             return self.looks
-        return self.output[None]
+        is_mirrored = len(self.inputs) > 1 and np.array_equal(inputs[0], self.inputs[-2][0, :, ::-1])
+        return (mirrored(self.output) if is_mirrored else self.output)[None]
+
+
+def mirrored(output: Outputs) -> Outputs:
+    """Returns what the network outputs for the mirror image of a crop for which it returns `output`."""
+    left, right, left_sigma, right_sigma = np.split(output[:12], 4)
+    return np.concatenate([-right, -left, right_sigma, left_sigma, output[[13, 12, 14]]])
 
 
 def detect(output: Outputs, horizon: float = HORIZON) -> Detections:
@@ -76,6 +83,29 @@ def test_an_output_is_read_as_the_curves_it_was_made_of() -> None:
     curves = RegressorOutput.of(output_for(VIEW)).curves(VIEW)
     for curve, expected in zip(curves, (LEFT, RIGHT), strict=True):
         np.testing.assert_allclose(curve.coefficients, expected.coefficients, rtol=1e-3)
+
+
+def test_the_output_of_a_mirrored_crop_is_mirrored_back() -> None:
+    output = off_the_paint(0.02)
+    output[6:12] = np.linspace(0.01, 0.06, 6)
+    output[12:15] = 0.7, 0.8, 0.1
+    straight, back = RegressorOutput.of(output), RegressorOutput.of(mirrored(output)).mirrored
+    mean = straight.mean(back)
+    for name in ("columns", "sigma", "presence", "horizon"):
+        np.testing.assert_allclose(getattr(back, name), getattr(straight, name), rtol=1e-6)
+        np.testing.assert_allclose(getattr(mean, name), getattr(straight, name), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("sigma", "calls"), [(0.01, 1), (0.03, 2)])
+def test_an_uncertain_network_gets_the_mirrored_crop_too(sigma: float, calls: int) -> None:
+    output = output_for(VIEW)
+    output[6:12] = sigma
+    infer = FakeRegressor(output)
+    prediction, _ = REGRESSOR.predict(ROAD, HORIZON, infer)
+    assert len(infer.inputs) == calls
+    np.testing.assert_allclose(prediction.columns, RegressorOutput.of(output).columns, rtol=1e-5)
+    if calls == 2:
+        np.testing.assert_array_equal(infer.inputs[1][0], infer.inputs[0][0, :, ::-1])
 
 
 def test_the_network_gets_a_road_crop() -> None:
