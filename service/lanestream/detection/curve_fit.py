@@ -67,7 +67,7 @@ class FitSettings:
 
     reach: float = 0.16
     cells: int = 97
-    rounds: tuple[float, ...] = (0.06, 0.045, 0.03)
+    rounds: tuple[float, ...] = (0.06, 0.035)
     move_horizon: bool = True
 
 

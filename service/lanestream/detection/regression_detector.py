@@ -17,7 +17,7 @@ from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_spans
 
 # The network's curves are less exact than candidates, so the fit searches for paint farther away.
-_FIT: Final = FitSettings(reach=0.24, rounds=(0.09, 0.06, 0.04, 0.04))
+_FIT: Final = FitSettings(reach=0.24, rounds=(0.09, 0.06, 0.04))
 # The fit's prior is the network's curve with its sigma times this factor, and at least this sigma, in depths.
 _SIGMA_FACTOR: Final = 1.5
 _LEAST_SIGMA: Final = 0.003
