@@ -13,9 +13,9 @@ from lanestream.road.view import Image, RoadView
 ROAD, PAINT = 90, 210
 
 
-def straight(view: RoadView, place: float) -> Curve:
-    """Returns a straight boundary at the lateral position `place`, in row offsets from the middle."""
-    return Curve(view.horizon, (view.middle, place, 0.0))
+def straight(view: RoadView, position: float) -> Curve:
+    """Returns a straight boundary at the lateral position `position`, in row offsets from the middle."""
+    return Curve(view.horizon, (view.middle, position, 0.0))
 
 
 def draw_road(

@@ -48,13 +48,13 @@ def caltech_entries(folder: DataFolder) -> LabelEntries:
             yield error
             continue
         for number, frame in enumerate(frames, start=1):
-            place = f"{path}: frame {number}"
+            location = f"{path}: frame {number}"
             try:
-                yield _entry(frame, place, path, folder)
+                yield _entry(frame, location, path, folder)
             except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
-                yield LabelError(f"{place}: {error}", "a frame needs a frame and labels with points and a type")
+                yield LabelError(f"{location}: {error}", "a frame needs a frame and labels with points and a type")
             except LabelError as error:
-                yield error_at(place, error)
+                yield error_at(location, error)
 
 
 def _frames(path: Path) -> list[Any]:
@@ -69,7 +69,7 @@ def _frames(path: Path) -> list[Any]:
         ) from None
 
 
-def _entry(frame: Any, place: str, path: Path, folder: DataFolder) -> LabelEntry:
+def _entry(frame: Any, location: str, path: Path, folder: DataFolder) -> LabelEntry:
     lanes, others = {}, []
     for number, label in enumerate(_items(frame.labels), start=1):
         points = points_of(np.atleast_2d(label.points))
@@ -84,7 +84,7 @@ def _entry(frame: Any, place: str, path: Path, folder: DataFolder) -> LabelEntry
             others.append(shape)
     image = folder.find(path.parent / path_in_labels(frame.frame))
     group = drive_of(path.parent)
-    return LabelEntry(place, folder.name(image), group, ImageLocation(image), lanes, others=tuple(others))
+    return LabelEntry(location, folder.name(image), group, ImageLocation(image), lanes, others=tuple(others))
 
 
 def _items(value: Any) -> list[Any]:

@@ -63,7 +63,7 @@ def _counts(counter: Counter[int] | Counter[str]) -> str:
 class _FirstUse:
     """Where an image was used first."""
 
-    place: str
+    location: str
     group: str
 
 
@@ -77,7 +77,7 @@ class DatasetCheck:
     def __init__(self) -> None:
         self.contents = DatasetContents()
         self.faults: list[LabelError] = []
-        self._places: dict[tuple[str, str], str] = {}
+        self._locations: dict[tuple[str, str], str] = {}
         self._images: dict[bytes, _FirstUse] = {}
 
     def add(self, found: LabeledSample | LabelError) -> None:
@@ -90,21 +90,22 @@ class DatasetCheck:
         self._find_duplicate(found)
 
     def _find_duplicate(self, sample: LabeledSample) -> None:
-        place, source, group = sample.entry.place, sample.frame.source, sample.frame.group
-        if (group, source) in self._places:
-            first = self._places[group, source]
-            self.faults.append(LabelError(f"{place}: {source} is labeled a second time, after {first}"))
+        location, source, group = sample.entry.location, sample.frame.source, sample.frame.group
+        if (group, source) in self._locations:
+            first = self._locations[group, source]
+            self.faults.append(LabelError(f"{location}: {source} is labeled a second time, after {first}"))
             return
-        self._places[group, source] = place
-        used = self._images.setdefault(_digest(sample), _FirstUse(place, group))
+        self._locations[group, source] = location
+        used = self._images.setdefault(_digest(sample), _FirstUse(location, group))
         if used.group != group:
             self.faults.append(
                 LabelError(
-                    f"{place}: {source} has the image of {used.place}, but its group is {group!r}, not {used.group!r}"
+                    f"{location}: {source} has the image of {used.location}, "
+                    f"but its group is {group!r}, not {used.group!r}"
                 )
             )
-        elif used.place != place and sample.entry.image.index is None:
-            self.faults.append(LabelError(f"{place}: {source} has the same image as {used.place}"))
+        elif used.location != location and sample.entry.image.index is None:
+            self.faults.append(LabelError(f"{location}: {source} has the same image as {used.location}"))
 
     def leaks(self, other: DatasetCheck) -> list[LabelError]:
         """Returns what this data set shares with the `other` side of a split: groups, and images in other groups."""
@@ -117,7 +118,7 @@ class DatasetCheck:
         for digest in self._images.keys() & other._images.keys():
             mine, theirs = self._images[digest], other._images[digest]
             if mine.group not in shared_groups:
-                faults.append(LabelError(f"{mine.place}: its image is on the other side too, at {theirs.place}"))
+                faults.append(LabelError(f"{mine.location}: its image is on the other side too, at {theirs.location}"))
         return sorted(faults, key=str)
 
 

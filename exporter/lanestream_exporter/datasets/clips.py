@@ -47,11 +47,11 @@ def read_clip_labels(path: Path, coverage: Coverage = PARTIAL) -> dict[int, Labe
     `coverage` says what the labels cover. Raises LabelError that names the file and the line.
     """
     frames: dict[int, LabeledFrame] = {}
-    for place, record in read_json_lines(path):
+    for location, record in read_json_lines(path):
         try:
             frames[int(record["frame"])] = _frame(record, path, coverage)
         except (ValueError, KeyError, TypeError, OverflowError) as error:
-            raise field_error(place, error, _NEEDED) from error
+            raise field_error(location, error, _NEEDED) from error
     return frames
 
 
@@ -63,23 +63,23 @@ def _frame(record: dict[str, Any], path: Path, coverage: Coverage) -> LabeledFra
 
 
 def _file_entries(path: Path, folder: DataFolder) -> LabelEntries:
-    for place, record in scan_json_lines(path):
+    for location, record in scan_json_lines(path):
         if isinstance(record, LabelError):
             yield record
             continue
         try:
-            yield _entry(record, place, path, folder)
+            yield _entry(record, location, path, folder)
         except (ValueError, KeyError, TypeError, OverflowError, AttributeError) as error:
-            yield field_error(place, error, _NEEDED)
+            yield field_error(location, error, _NEEDED)
         except LabelError as error:
-            yield error_at(place, error)
+            yield error_at(location, error)
 
 
 def _video_index(found: LabelEntry | LabelError) -> int:
     return 0 if isinstance(found, LabelError) else found.image.index or 0
 
 
-def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -> LabelEntry:
+def _entry(record: dict[str, Any], location: str, path: Path, folder: DataFolder) -> LabelEntry:
     size = size_of(record["width"], record["height"])
     lanes = numbered(_lanes(record))
     clip = path_in_labels(record.get("clip") or f"{path.stem}.mp4")
@@ -88,15 +88,15 @@ def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -
         index = int(record["frame"])
         video = folder.find_video(clip, path)
         source = f"{video.name}#{index}"
-        return LabelEntry(place, source, clip.stem, ImageLocation(video, index), lanes, size, video, index, split)
+        return LabelEntry(location, source, clip.stem, ImageLocation(video, index), lanes, size, video, index, split)
     image = folder.find(path.parent / path_in_labels(record["image"]))
     if "clip" not in record or "frame" not in record:
         group = clip.stem if "clip" in record else drive_of(image.parent)
-        return LabelEntry(place, folder.name(image), group, ImageLocation(image), lanes, size, split=split)
+        return LabelEntry(location, folder.name(image), group, ImageLocation(image), lanes, size, split=split)
     index = int(record["frame"])
     video_or_none = _video_if_there(clip, path, folder)
     source = f"{clip.name}#{index}"
-    return LabelEntry(place, source, clip.stem, ImageLocation(image), lanes, size, video_or_none, index, split)
+    return LabelEntry(location, source, clip.stem, ImageLocation(image), lanes, size, video_or_none, index, split)
 
 
 def _video_if_there(clip: Path, path: Path, folder: DataFolder) -> Path | None:

@@ -44,13 +44,13 @@ def cvat_entries(folder: DataFolder) -> LabelEntries:
             yield error
             continue
         for image in root.iterfind("image"):
-            place = f"{path}: image {image.get('name')}"
+            location = f"{path}: image {image.get('name')}"
             try:
-                yield _image_entry(image, place, _Export(path, root, folder))
+                yield _image_entry(image, location, _Export(path, root, folder))
             except (ValueError, KeyError, TypeError, OverflowError) as error:
-                yield field_error(place, error, "name, width and height, and a polyline points")
+                yield field_error(location, error, "name, width and height, and a polyline points")
             except LabelError as error:
-                yield error_at(place, error)
+                yield error_at(location, error)
         yield from _track_entries(_Export(path, root, folder))
 
 
@@ -82,7 +82,7 @@ def _root(path: Path) -> Element:
     return root
 
 
-def _image_entry(image: Element, place: str, export: _Export) -> LabelEntry:
+def _image_entry(image: Element, location: str, export: _Export) -> LabelEntry:
     name, base = path_in_labels(image.attrib["name"]), export.path.parent
     subset = path_in_labels(image.get("subset") or ".")
     found = export.folder.find(base / "images" / name, base / name, base / "images" / subset / name)
@@ -99,7 +99,7 @@ def _image_entry(image: Element, place: str, export: _Export) -> LabelEntry:
     size = size_of(image.attrib["width"], image.attrib["height"])
     source = export.folder.name(found)
     return LabelEntry(
-        place, source, group, ImageLocation(found), numbered(lanes, "polyline"), size, others=tuple(others)
+        location, source, group, ImageLocation(found), numbered(lanes, "polyline"), size, others=tuple(others)
     )
 
 
@@ -142,11 +142,11 @@ def _track_entries(export: _Export) -> LabelEntries:
         yield error_at(str(export.path), error)
         return
     for index in sorted(frames):
-        place = f"{export.path}: frame {index}"
+        location = f"{export.path}: frame {index}"
         try:
-            yield task.entry(index, place, frames[index])
+            yield task.entry(index, location, frames[index])
         except LabelError as error:
-            yield error_at(place, error)
+            yield error_at(location, error)
 
 
 @dataclass(frozen=True)
@@ -173,11 +173,11 @@ class _VideoTask:
             video = folder.find(base / source, folder.root / source, folder.root / "clips" / source)
         return cls(export, video, source.stem, size_of(*size) if all(size) else None)
 
-    def entry(self, index: int, place: str, lanes: dict[str, LabeledLane]) -> LabelEntry:
+    def entry(self, index: int, location: str, lanes: dict[str, LabeledLane]) -> LabelEntry:
         """Returns the entry of a frame. Raises LabelError if its image is missing."""
         if self.video is not None:
             source, image = f"{self.video.name}#{index}", ImageLocation(self.video, index)
         else:
             path = self.export.folder.find_image(self.export.path.parent / "images" / f"frame_{index:06d}")
             source, image = self.export.folder.name(path), ImageLocation(path)
-        return LabelEntry(place, source, self.group, image, lanes, self.size, self.video, index)
+        return LabelEntry(location, source, self.group, image, lanes, self.size, self.video, index)

@@ -28,13 +28,13 @@ _COLORS: Final = frozenset({"white", "yellow", "blue", "red", "orange"})
 class LabelEntry:
     """A labeled frame as its label file describes it.
 
-    `place` is where the record stands, `file:line` or `file: element`; the keys of `lanes` are places within it.
+    `location` is where the record stands, `file:line` or `file: element`; the keys of `lanes` are locations within it.
     `size` is the (width, height) of the image if the labels give it. `video` and `index` name the video that the frame
     was taken from and its number there, if known. `split` is the record's own split. `extends_beyond_image` is true
     for formats whose boundaries run on outside the image. `others` names labeled shapes that are not lines.
     """
 
-    place: str
+    location: str
     source: str
     group: str
     image: ImageLocation
@@ -62,7 +62,7 @@ class LabelFormat:
 
 
 def numbered(lanes: Iterable[LabeledLane], noun: str = "lane") -> dict[str, LabeledLane]:
-    """Returns lanes by their place in a list, counted from one."""
+    """Returns lanes by their number in a list, counted from one."""
     return {f"{noun} {number}": lane for number, lane in enumerate(lanes, start=1)}
 
 

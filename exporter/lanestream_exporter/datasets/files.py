@@ -92,11 +92,11 @@ def path_in_labels(name: str) -> Path:
 
 
 def read_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yields (place, object) for each line of `path`, the place as `file:line`. Raises LabelError for a bad line."""
-    for place, record in scan_json_lines(path):
+    """Yields (location, object) of each line in `path`; locations are `file:line`. Raises LabelError for bad lines."""
+    for location, record in scan_json_lines(path):
         if isinstance(record, LabelError):
             raise record
-        yield place, record
+        yield location, record
 
 
 def scan_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelError]]:
@@ -107,11 +107,11 @@ def scan_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelErr
         yield str(path), error
         return
     for number, line in enumerate(lines, start=1):
-        place = f"{path}:{number}"
+        location = f"{path}:{number}"
         try:
-            yield place, json_object(line, place, _JSON_LINES)
+            yield location, json_object(line, location, _JSON_LINES)
         except LabelError as error:
-            yield place, error
+            yield location, error
 
 
 def read_text(path: Path, accepted: str = _JSON_LINES) -> str:
@@ -124,28 +124,28 @@ def read_text(path: Path, accepted: str = _JSON_LINES) -> str:
         raise LabelError(f"{path} is not a text file", accepted) from None
 
 
-def json_object(text: str, place: str, accepted: str) -> dict[str, Any]:
-    """Returns the JSON object in `text`. Raises LabelError that names the `place` and what is `accepted` there."""
+def json_object(text: str, location: str, accepted: str) -> dict[str, Any]:
+    """Returns the JSON object in `text`. Raises LabelError that names the `location` and what is `accepted` there."""
     try:
         found = json.loads(text)
     except json.JSONDecodeError as error:
-        raise LabelError(f"{place}: not JSON: {error.msg}", accepted) from None
+        raise LabelError(f"{location}: not JSON: {error.msg}", accepted) from None
     except (RecursionError, ValueError):
-        raise LabelError(f"{place}: not readable JSON: nested too deeply, or a number too long", accepted) from None
+        raise LabelError(f"{location}: not readable JSON: nested too deeply, or a number too long", accepted) from None
     if not isinstance(found, dict):
-        raise LabelError(f"{place}: not a JSON object", accepted)
+        raise LabelError(f"{location}: not a JSON object", accepted)
     return found
 
 
-def error_at(place: str, error: LanestreamError) -> LabelError:
-    """Returns `error` as the error of the record at `place`."""
-    return LabelError(f"{place}: {error.message}", error.hint)
+def error_at(location: str, error: LanestreamError) -> LabelError:
+    """Returns `error` as the error of the record at `location`."""
+    return LabelError(f"{location}: {error.message}", error.hint)
 
 
-def field_error(place: str, error: Exception, needed: str) -> LabelError:
-    """Returns the error of a record at `place` whose fields are missing or have other types than `needed`."""
+def field_error(location: str, error: Exception, needed: str) -> LabelError:
+    """Returns the error of a record at `location` whose fields are missing or have other types than `needed`."""
     reason = f"there is no {error}" if isinstance(error, KeyError) else str(error)
-    return LabelError(f"{place}: {reason}", f"a record needs {needed}")
+    return LabelError(f"{location}: {reason}", f"a record needs {needed}")
 
 
 def _normalized(path: Path) -> Path:

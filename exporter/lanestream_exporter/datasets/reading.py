@@ -78,13 +78,13 @@ def open_entry(
     try:
         image = images.open(entry.image)
     except LanestreamError as error:
-        faults.append(error_at(f"{entry.place}: {entry.source}", error))
+        faults.append(error_at(f"{entry.location}: {entry.source}", error))
     else:
         actual = image.shape[1], image.shape[0]
         size = size or actual
         if size != actual:
             one, other = (" x ".join(map(str, pair)) for pair in (actual, size))
-            faults.append(LabelError(f"{entry.place}: {entry.source} is {one}, but its labels are for {other}"))
+            faults.append(LabelError(f"{entry.location}: {entry.source} is {one}, but its labels are for {other}"))
     frame, lane_faults = labeled_frame(entry, size, coverage) if size is not None else (None, [])
     faults += lane_faults
     yield from faults
@@ -107,5 +107,5 @@ def labeled_frame(
         try:
             lanes.append(replace(lane, points=checked_points(points, *size)))
         except ValueError as error:
-            faults.append(LabelError(f"{entry.place}: {name}: {error}"))
+            faults.append(LabelError(f"{entry.location}: {name}: {error}"))
     return LabeledFrame(*size, tuple(lanes), entry.group, entry.source, coverage), faults

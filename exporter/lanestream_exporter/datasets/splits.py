@@ -98,13 +98,14 @@ def split_of(rule: SplitRule, entry: LabelEntry, validation_groups: frozenset[st
         if entry.split not in SPLITS:
             found = "the record has no split" if entry.split is None else f"{entry.split!r} is not a split"
             raise LabelError(
-                f"{entry.place}: {found}",
+                f"{entry.location}: {found}",
                 f"a field `split` with {', '.join(SPLITS)} is accepted, or another split rule in the manifest",
             )
         return entry.split
     if entry.index is None:
         raise LabelError(
-            f"{entry.place}: {entry.source} has no frame number", "frames can only be split by number if labels give it"
+            f"{entry.location}: {entry.source} has no frame number",
+            "frames can only be split by number if labels give it",
         )
     return next((split for split in SPLITS if entry.index in rule.range_of(split)), None)
 

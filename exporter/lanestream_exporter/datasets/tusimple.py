@@ -35,25 +35,25 @@ def is_tusimple(path: Path, start: bytes) -> bool:
 def tusimple_entries(folder: DataFolder) -> LabelEntries:
     """Yields the frames of TuSimple's JSON lines files. A group is a drive: 0313-1 of clips/0313-1/6040/20.jpg."""
     for path in folder.with_suffix(".json", ".jsonl"):
-        for place, record in scan_json_lines(path):
+        for location, record in scan_json_lines(path):
             if isinstance(record, LabelError):
                 yield record
                 continue
             try:
-                yield _entry(record, place, path, folder)
+                yield _entry(record, location, path, folder)
             except (ValueError, KeyError, TypeError, OverflowError) as error:
-                yield field_error(place, error, _NEEDED)
+                yield field_error(location, error, _NEEDED)
             except LabelError as error:
-                yield error_at(place, error)
+                yield error_at(location, error)
 
 
-def _entry(record: dict[str, Any], place: str, path: Path, folder: DataFolder) -> LabelEntry:
+def _entry(record: dict[str, Any], location: str, path: Path, folder: DataFolder) -> LabelEntry:
     name = path_in_labels(record["raw_file"])
     lanes = numbered(_lanes(record))
     image = folder.find(path.parent / name, folder.root / name)
     official = PurePosixPath(str(record.get("source", name.as_posix()))).parts
     group = f"tusimple {official[1]}" if official[:1] == ("clips",) and len(official) > 3 else drive_of(image.parent)
-    return LabelEntry(place, folder.name(image), group, ImageLocation(image), lanes, split=record.get("split"))
+    return LabelEntry(location, folder.name(image), group, ImageLocation(image), lanes, split=record.get("split"))
 
 
 def _lanes(record: dict[str, Any]) -> Iterator[LabeledLane]:

@@ -74,8 +74,8 @@ class RegressorTask:
             prediction, named = RegressorPrediction.of(torch.cat(parts).float()), _named(targets)
             losses.append(float(lateral_loss(prediction, named)))
             figures[f"{name}_loss"] = losses[-1]
-            for place, error in lateral_errors(prediction, named).items():
-                figures[f"{name}_px_{place}"] = error
+            for distance, error in lateral_errors(prediction, named).items():
+                figures[f"{name}_px_{distance}"] = error
         return {SELECTED_BY: sum(losses) / len(losses), **figures}
 
     def _unwarped(self, frames: Sequence[RoadFrame]) -> Batch:
@@ -93,7 +93,7 @@ def lateral_errors(prediction: RegressorPrediction, targets: dict[str, Tensor]) 
     """Returns the mean distance from the labels in pixels at 640 wide, about 10 m and 30 m ahead."""
     error = 640.0 * (prediction.columns @ at_shares().T - targets["columns"]).abs()
     known = targets["known"] >= 1.0
-    return {place: float(error[:, :, i][known[:, :, i]].mean()) for place, i in _REPORTED.items()}
+    return {distance: float(error[:, :, i][known[:, :, i]].mean()) for distance, i in _REPORTED.items()}
 
 
 def draw_frames(frames: Sequence[RoadFrame], count: int, rng: np.random.Generator) -> list[RoadFrame]:

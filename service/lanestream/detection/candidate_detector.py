@@ -145,5 +145,5 @@ def _separated(detections: list[Detection], view: RoadView) -> tuple[Detection, 
 def _gaps(curves: Curves, view: RoadView) -> FloatArray:
     """Returns how far each curve is to the right of every other one at three rows, in row offsets (N, N, 3)."""
     below = _COMPARED * view.depth
-    places = curves.x(view.horizon + below) / below
-    return np.asarray(places[:, None] - places)
+    positions = curves.x(view.horizon + below) / below
+    return np.asarray(positions[:, None] - positions)

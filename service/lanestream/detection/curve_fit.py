@@ -151,8 +151,8 @@ class _Strips:
         # A bar five gray levels above the texture of its row is visible to a person. Weights are squared, so that a few
         # bright dots outweigh a wheel track that is slightly lighter over its whole length.
         texture = np.abs(contrast).mean(axis=2, keepdims=True)
-        place = int((1.0 - _BEST_ROWS) * (self.y.shape[1] - 1))
-        best = np.maximum(np.partition(contrast.max(axis=2), place, axis=1)[:, place], 0.0)
+        rank = int((1.0 - _BEST_ROWS) * (self.y.shape[1] - 1))
+        best = np.maximum(np.partition(contrast.max(axis=2), rank, axis=1)[:, rank], 0.0)
         bars: NDArray[np.float32] = (contrast - texture) / (texture + (5.0 + _BEST_FACTOR * best)[:, None, None])
         np.clip(bars, 0.0, 1.0, out=bars)
         bars *= bars
@@ -246,8 +246,8 @@ class _JointFit:
         """Returns normal equations (N, 3, 3) and (N, 3) of the shifts, from the bars near the curves `theta` (N, 3)."""
         strips = self._strips
         both = row_basis @ np.stack([theta, start], axis=2)
-        place = ((both[:, :, 0] - strips.x) / self._scale).astype(np.float32)
-        distance = strips.across - place[:, :, None]
+        position = ((both[:, :, 0] - strips.x) / self._scale).astype(np.float32)
+        distance = strips.across - position[:, :, None]
         distance *= np.float32(1.0 / reach)
         distance *= distance
         distance += np.float32(1.0)

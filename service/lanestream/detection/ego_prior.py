@@ -112,9 +112,9 @@ class EgoPrior:
         v, _, k = self.curves.coefficients.mean(axis=0).tolist()
         return VanishingPoint(v, self.view.horizon, k, 1.0)
 
-    def spacing(self, places: FloatArray, least: float) -> LaneSpacing:
-        """Returns the lane-spacing model of an ego lane whose boundaries (M,), at least one, are at `places`."""
-        at = dict(zip(self.sides, places.tolist(), strict=True))
+    def spacing(self, positions: FloatArray, least: float) -> LaneSpacing:
+        """Returns the lane-spacing model of an ego lane whose boundaries (M,), at least one, are at `positions`."""
+        at = dict(zip(self.sides, positions.tolist(), strict=True))
         left = at[-1] if -1 in at else at[1] - USUAL_LANE_WIDTH
         right = at[1] if 1 in at else at[-1] + USUAL_LANE_WIDTH
         return LaneSpacing(left, right, least)
@@ -127,15 +127,15 @@ class EgoPrior:
         """
         below = _COMPARED * self.view.depth
         rows = self.view.horizon + below
-        places = curves.x(rows) / below
+        positions = curves.x(rows) / below
         mine = self.curves.x(rows) / below
-        distance = (places[:, None] - mine) / self.sigma
+        distance = (positions[:, None] - mine) / self.sigma
         odds = np.ones(len(curves))
         if len(mine) == 2:
             inside = np.minimum(distance[:, 0].mean(axis=1), -distance[:, 1].mean(axis=1))
             left, right = mine.mean(axis=1).tolist()
             spacing = LaneSpacing(left, right, _UNSPACED_SHARE)
-            odds = _SPACED_ODDS * spacing.weight(places.mean(axis=1)) / (1.0 + np.exp(inside.clip(-30.0, 30.0)))
+            odds = _SPACED_ODDS * spacing.weight(positions.mean(axis=1)) / (1.0 + np.exp(inside.clip(-30.0, 30.0)))
         density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (distance**2).mean(axis=2) / 3.0) ** 2 / self.sigma.mean(axis=1)
         return np.asarray(odds + USUAL_LANE_WIDTH * density @ self.presence)
 
@@ -167,10 +167,10 @@ class LaneSpacing:
         """The next boundaries outside the ego lane, left and right (2,)."""
         return np.array([self.left - self.width, self.right + self.width])
 
-    def weight(self, places: FloatArray) -> FloatArray:
-        """Returns how likely lines at lateral `places` (N,) are boundaries, 0 to 1, judged by their positions alone."""
-        is_left = places < 0.5 * (self.left + self.right)
-        outside = np.where(is_left, self.left - places, places - self.right) / self.width
+    def weight(self, positions: FloatArray) -> FloatArray:
+        """Returns how likely lines are boundaries, 0 to 1 (N,), judged by their lateral `positions` (N,) alone."""
+        is_left = positions < 0.5 * (self.left + self.right)
+        outside = np.where(is_left, self.left - positions, positions - self.right) / self.width
         lanes = np.maximum(0.0, np.rint(outside))
         near = np.exp(-0.5 * ((outside - lanes) / self._TOLERANCE) ** 2)
         weight: FloatArray = (self.least + (1.0 - self.least) * near) * np.where(lanes <= 1.0, 1.0, self._OUTER_WEIGHT)

@@ -73,9 +73,9 @@ def find_ridges(gray: Image, point: VanishingPoint) -> Ridges:
     """Returns the ridges of a gray working image (H, W) whose road has approximately the vanishing point `point`."""
     height, width = gray.shape
     rows = np.linspace(point.y + TOP_SHARE * (height - 1.0 - point.y), height - 1.0, ROWS)
-    places = np.arange(-REACH, REACH + STEP / 2, STEP)
-    columns = point.columns(places, rows).astype(np.float32)
-    row_map = np.repeat(rows.astype(np.float32)[:, None], len(places), axis=1)
+    positions = np.arange(-REACH, REACH + STEP / 2, STEP)
+    columns = point.columns(positions, rows).astype(np.float32)
+    row_map = np.repeat(rows.astype(np.float32)[:, None], len(positions), axis=1)
     road = np.asarray(cv2.remap(gray, columns, row_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     texture = cv2.absdiff(road, cv2.blur(road, (_cells(0.5), 1)))
     around = cv2.boxFilter(texture, cv2.CV_32F, (_cells(2.0), 9)) + 6.0

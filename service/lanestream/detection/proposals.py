@@ -75,14 +75,14 @@ def propose(
     point = road.point
     view = RoadView(width, height, point.y)
     lines = find_lines(road.ridges, point, width)
-    found, strength = point.curves(lines.places), _normalized(lines.strength)
+    found, strength = point.curves(lines.positions), _normalized(lines.strength)
     tracked = (context.tracked or Curves.none(point.y)).below(point.y, view.bottom)
     leading = [tracked]
     if prior is not None and prior.sides:
         own = prior.curves.below(point.y, view.bottom)
         bottom = np.array([view.bottom])
-        spacing = prior.spacing(point.places(own.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
-        strength = strength * spacing.weight(lines.places)
+        spacing = prior.spacing(point.positions(own.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
+        strength = strength * spacing.weight(lines.positions)
         leading += [own, point.curves(spacing.neighbors)]
     if road.hough is not None:
         curves, votes = hough_curves(road.hough, point, view)

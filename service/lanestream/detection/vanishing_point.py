@@ -178,12 +178,12 @@ _MOST_LINES: Final = 24
 
 @dataclass(frozen=True)
 class FoundLines:
-    """Lines through the vanishing point: lateral positions `places` (N,) and `strength` (N,) in ridges per row.
+    """Lines through the vanishing point: lateral positions `positions` (N,) and `strength` (N,) in ridges per row.
 
     The strongest comes first.
     """
 
-    places: FloatArray
+    positions: FloatArray
     strength: FloatArray
 
 
@@ -194,7 +194,7 @@ def find_lines(ridges: Ridges, point: VanishingPoint, width: int) -> FoundLines:
     votes of dashes and dots add up over all rows.
     """
     cells = np.arange(-REACH, REACH + STEP / 2, STEP)
-    votes = _votes(point.places(ridges.x, ridges.y), ridges.weight, len(cells))
+    votes = _votes(point.positions(ridges.x, ridges.y), ridges.weight, len(cells))
     # Lines that are visible in few rows, near the sides of the image, would win, so the mean includes some empty rows.
     profile = votes / (_visible_rows(cells, ridges.rows, point, width) + 0.2 * len(ridges.rows))
     window = 2 * max(1, round(_SEPARATION / STEP / 2)) + 1
@@ -204,9 +204,9 @@ def find_lines(ridges: Ridges, point: VanishingPoint, width: int) -> FoundLines:
     return FoundLines(cells[order], profile[order])
 
 
-def _votes(places: FloatArray, weight: FloatArray, cells: int) -> FloatArray:
+def _votes(positions: FloatArray, weight: FloatArray, cells: int) -> FloatArray:
     """Returns a smooth histogram (cells,) of the ridges' lateral positions, each counted in its two nearest cells."""
-    position = np.clip((places + REACH) / STEP, 0.0, cells - 1.001)
+    position = np.clip((positions + REACH) / STEP, 0.0, cells - 1.001)
     cell = position.astype(int)
     # Squared, so that a few bright dots outweigh a wheel track that is slightly lighter over its whole length.
     right = (position - cell) * weight**2
@@ -214,8 +214,8 @@ def _votes(places: FloatArray, weight: FloatArray, cells: int) -> FloatArray:
     return np.convolve(counts, np.hanning(2 * round(_VOTE_WIDTH / STEP) + 1), mode="same")
 
 
-def _visible_rows(places: FloatArray, rows: FloatArray, point: VanishingPoint, width: int) -> FloatArray:
-    """Returns in how many of `rows` the boundaries at `places` (N,), in ascending order, are inside the image."""
-    leftmost, rightmost = (np.sort(point.places(np.full(len(rows), x), rows)) for x in (0.0, width - 1.0))
-    visible = np.searchsorted(leftmost, places, "right") - np.searchsorted(rightmost, places, "left")
+def _visible_rows(positions: FloatArray, rows: FloatArray, point: VanishingPoint, width: int) -> FloatArray:
+    """Returns in how many of `rows` the boundaries at `positions` (N,), in ascending order, are inside the image."""
+    leftmost, rightmost = (np.sort(point.positions(np.full(len(rows), x), rows)) for x in (0.0, width - 1.0))
+    visible = np.searchsorted(leftmost, positions, "right") - np.searchsorted(rightmost, positions, "left")
     return np.asarray(visible, float)

@@ -130,22 +130,22 @@ class VanishingPoint:
     k: float = 0.0
     weight: float = 0.0
 
-    def columns(self, places: FloatArray, rows: FloatArray) -> FloatArray:
-        """Returns the columns (R, P) of boundaries with the lateral positions b = `places` (P,) at `rows` (R,)."""
+    def columns(self, positions: FloatArray, rows: FloatArray) -> FloatArray:
+        """Returns the columns (R, P) of boundaries with the lateral `positions` b (P,) at `rows` (R,)."""
         u = np.maximum(rows - self.y, 1.0)[:, None]
-        columns: FloatArray = (self.x + self.k / u) + u * places
+        columns: FloatArray = (self.x + self.k / u) + u * positions
         return columns
 
-    def places(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
+    def positions(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
         """Returns the lateral positions b (N,) of the boundaries through the points (`columns`, `rows`), each (N,)."""
         u = np.maximum(rows - self.y, 1.0)
-        places: FloatArray = (columns - self.x - self.k / u) / u
-        return places
+        positions: FloatArray = (columns - self.x - self.k / u) / u
+        return positions
 
-    def curves(self, places: FloatArray) -> Curves:
-        """Returns the boundaries with the lateral positions b = `places` (N,)."""
-        coefficients = np.empty((len(places), 3))
-        coefficients[:, 0], coefficients[:, 1], coefficients[:, 2] = self.x, places, self.k
+    def curves(self, positions: FloatArray) -> Curves:
+        """Returns the boundaries with the lateral `positions` b (N,)."""
+        coefficients = np.empty((len(positions), 3))
+        coefficients[:, 0], coefficients[:, 1], coefficients[:, 2] = self.x, positions, self.k
         return Curves(self.y, coefficients)
 
 

@@ -1,4 +1,4 @@
-"""Every kind of bad record, in every label format, is reported with its place."""
+"""Every kind of bad record, in every label format, is reported with its location."""
 
 from __future__ import annotations
 
@@ -282,8 +282,8 @@ def test_no_record_raises_anything_else(tmp_path_factory: pytest.TempPathFactory
     format_name = data.draw(st.sampled_from(sorted(_SOUND)))
     record = deepcopy(_SOUND[format_name])
     field = data.draw(st.sampled_from(_paths(record)))
-    place = record if len(field) == 1 else record[field[0]][0]
-    place[field[-1]] = data.draw(_JSON)
+    location = record if len(field) == 1 else record[field[0]][0]
+    location[field[-1]] = data.draw(_JSON)
     (folder / ("labels.jsonl" if format_name == "clips" else "labels.json")).write_text(json.dumps(record))
     check = check_dataset(folder, format_name)
     assert len(check.faults) + check.contents.groups.total() >= 1

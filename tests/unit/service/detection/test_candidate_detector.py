@@ -99,7 +99,7 @@ def test_the_ego_boundaries_are_proposed_at_any_size(width: int, height: int) ->
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_a_perfect_classifier_gives_exact_boundaries(width: int, height: int) -> None:
-    """With the truth in place of the classifier only the geometry is left, which must be exact to a pixel or two."""
+    """With the truth instead of the classifier only the geometry is left, which must be exact to a pixel or two."""
     road = highway(width, height)
     patches: list[NDArray[np.uint8]] = []
 
@@ -133,7 +133,7 @@ def follows(curves: Curves, known: Curve, bottom: float) -> NDArray[np.bool_]:
 
 
 def test_tracked_boundaries_come_first_and_fewer_others_with_them() -> None:
-    gray = roads.draw_road(VIEW, [roads.straight(VIEW, place) for place in np.arange(-4.0, 4.1, 0.4).tolist()])
+    gray = roads.draw_road(VIEW, [roads.straight(VIEW, position) for position in np.arange(-4.0, 4.1, 0.4).tolist()])
     plain = propose(gray, FrameContext(150.0), None, None)
     assert len(plain.curves) == MOST_CANDIDATES == 16
     tracked = plain.curves.take([15])
@@ -232,7 +232,7 @@ def test_the_more_probable_of_two_crossing_lines_is_reported() -> None:
 
 
 def test_candidates_of_one_marking_become_one_boundary_at_their_mean_weighted_by_probability() -> None:
-    curves = Curves(150.0, np.array([[320.0, place, 0.0] for place in (-1.21, -1.17, -1.1, 1.2)]))
+    curves = Curves(150.0, np.array([[320.0, position, 0.0] for position in (-1.21, -1.17, -1.1, 1.2)]))
     proposals = Proposals(curves, visible_spans(curves, VIEW), VIEW, 0.7, None)
     outputs = np.array([[0.1, 0.9], [0.1, 0.9], [0.48, 0.52], [0.05, 0.95]], np.float32)
     detections = DETECTOR.decide(np.full((360, 640), 90, np.uint8), proposals, outputs)
@@ -261,7 +261,7 @@ def test_suppression_keeps_the_best_that_do_not_conflict(number: int, seed: int)
 
 
 def test_duplicates_are_near_at_both_rows_across_the_line() -> None:
-    curves = Curves(150.0, np.array([[320.0, place, 0.0] for place in (0.0, 0.04, 0.06, 3.0, 3.1)]))
+    curves = Curves(150.0, np.array([[320.0, position, 0.0] for position in (0.0, 0.04, 0.06, 3.0, 3.1)]))
     duplicates = are_duplicates(curves, curves, VIEW)
     assert duplicates[0].tolist() == [True, True, False, False, False]
     assert duplicates[3].tolist() == [False, False, False, True, True], (

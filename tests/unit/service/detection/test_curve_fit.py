@@ -22,9 +22,9 @@ FAR = np.array([VIEW.row_at(0.12), VIEW.row_at(0.2)])
 NEAR = np.array([VIEW.row_at(0.3), VIEW.row_at(0.5)])
 
 
-def on_road(*places: float, curvature: float = 600.0, column: float = 320.0) -> list[Curve]:
+def on_road(*positions: float, curvature: float = 600.0, column: float = 320.0) -> list[Curve]:
     """Returns boundaries of one road, which share a vanishing point and a curvature."""
-    return [Curve(VIEW.horizon, (column, place, curvature)) for place in places]
+    return [Curve(VIEW.horizon, (column, position, curvature)) for position in positions]
 
 
 def moved(curves: Sequence[Curve], *by: float) -> list[Curve]:

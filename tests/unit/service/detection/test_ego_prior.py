@@ -20,13 +20,13 @@ from lanestream.road.view import Image, RoadView, visible_spans
 VIEW = RoadView(640, 360, 150.0)
 
 
-def lines(*places: float) -> Curves:
+def lines(*positions: float) -> Curves:
     """Returns straight boundaries that cross the bottom row so many depths right of the middle."""
-    return Curves(150.0, np.array([[320.0, place, 0.0] for place in places]).reshape(-1, 3))
+    return Curves(150.0, np.array([[320.0, position, 0.0] for position in positions]).reshape(-1, 3))
 
 
 def prior_at(left: float | None, right: float | None, sigma: float = 0.05, presence: float = 0.98) -> EgoPrior:
-    seen = {side: place for side, place in ((-1, left), (1, right)) if place is not None}
+    seen = {side: position for side, position in ((-1, left), (1, right)) if position is not None}
     number = len(seen)
     return EgoPrior(VIEW, tuple(seen), lines(*seen.values()), np.full((number, 2), sigma), np.full(number, presence))
 
@@ -67,28 +67,28 @@ def test_one_boundary_alone_says_nothing_of_the_lane() -> None:
 
 
 def decided(prior: EgoPrior | None, probabilities: Mapping[float, float]) -> tuple[Detection, ...]:
-    """Returns the boundaries on a gray road if the classifier gives these probabilities to lines at these places."""
+    """Returns the boundaries on a gray road if the classifier gives these probabilities to lines at these positions."""
     curves = lines(*probabilities)
     outputs = np.array([[1.0 - p, p] for p in probabilities.values()], np.float32)
     proposals = Proposals(curves, visible_spans(curves, VIEW), VIEW, 1.0, prior)
     return CandidateDetector(0.5).decide(np.full((360, 640), 90, np.uint8), proposals, outputs).boundaries
 
 
-def places(detections: tuple[Detection, ...]) -> list[float]:
+def positions(detections: tuple[Detection, ...]) -> list[float]:
     return [detection.curve.coefficients[1] for detection in detections]
 
 
 def test_a_line_in_the_lane_is_not_a_boundary_even_if_the_classifier_accepts_it() -> None:
     probabilities = {-1.2: 0.95, 0.0: 0.95, 1.2: 0.95}
-    assert places(decided(None, probabilities)) == pytest.approx([-1.2, 0.0, 1.2], abs=0.05)
-    assert places(decided(prior_at(-1.2, 1.2), probabilities)) == pytest.approx([-1.2, 1.2], abs=0.05)
+    assert positions(decided(None, probabilities)) == pytest.approx([-1.2, 0.0, 1.2], abs=0.05)
+    assert positions(decided(prior_at(-1.2, 1.2), probabilities)) == pytest.approx([-1.2, 1.2], abs=0.05)
 
 
 def test_an_uncertain_candidate_is_accepted_where_the_prior_saw_a_boundary() -> None:
     probabilities = {-1.2: 0.95, 1.2: 0.3, 3.6: 0.3}
-    assert places(decided(None, probabilities)) == pytest.approx([-1.2], abs=0.05)
+    assert positions(decided(None, probabilities)) == pytest.approx([-1.2], abs=0.05)
     detections = decided(prior_at(-1.2, 1.2), probabilities)
-    assert places(detections) == pytest.approx([-1.2, 1.2], abs=0.05)
+    assert positions(detections) == pytest.approx([-1.2, 1.2], abs=0.05)
     assert all(0.5 < detection.probability < 1.0 for detection in detections)
 
 

@@ -14,7 +14,7 @@ from lanestream.road.curve import VanishingPoint
 
 WIDTH, HEIGHT = 640, 360
 BOTTOM = HEIGHT - 1.0
-PLACES = (-1.2, 1.1)
+POSITIONS = (-1.2, 1.1)
 
 
 def point(x: float, y: float, curvature: float = 0.0) -> VanishingPoint:
@@ -23,11 +23,11 @@ def point(x: float, y: float, curvature: float = 0.0) -> VanishingPoint:
 
 
 def drawn_road(vanishing: VanishingPoint, painted: float = 1.0) -> NDArray[np.uint8]:
-    """Returns markings at `PLACES`, 0.1 row offsets wide; of every 40 rows the share `painted` has paint."""
+    """Returns markings at `POSITIONS`, 0.1 row offsets wide; of every 40 rows the share `painted` has paint."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
     below = np.maximum(y - vanishing.y, 1.0)
     across = (x - vanishing.x - vanishing.k / below) / below
-    marked = np.any([np.abs(across - place) <= 0.05 for place in PLACES], axis=0)
+    marked = np.any([np.abs(across - position) <= 0.05 for position in POSITIONS], axis=0)
     has_paint = marked & (y > vanishing.y + 2.0) & (y % 40.0 < 40.0 * painted)
     return np.where(has_paint, 210, 80).astype(np.uint8)
 
@@ -40,14 +40,14 @@ def test_ridges_gather_along_markings(curvature: float, painted: float) -> None:
     assert (np.diff(ridges.weight) <= 0.0).all()
     lines = find_lines(ridges, vanishing, WIDTH)
     assert (np.diff(lines.strength) <= 0.0).all()
-    np.testing.assert_allclose(np.sort(lines.places[:2]), PLACES, atol=0.021)
+    np.testing.assert_allclose(np.sort(lines.positions[:2]), POSITIONS, atol=0.021)
 
 
 def test_a_road_without_markings_has_no_ridges() -> None:
     vanishing = point(300.0, 150.0)
     ridges = find_ridges(np.full((HEIGHT, WIDTH), 90, np.uint8), vanishing)
     assert len(ridges.x) == 0
-    assert len(find_lines(ridges, vanishing, WIDTH).places) == 0
+    assert len(find_lines(ridges, vanishing, WIDTH).positions) == 0
     assert refine(vanishing, ridges, WIDTH, BOTTOM, SearchRange(0.1, 0.1, 0.1, 100, ((3, 1.0),))) == vanishing
 
 
@@ -55,10 +55,10 @@ def test_the_vanishing_point_moves_to_where_ridges_gather() -> None:
     truth, guess = point(310.0, 152.0, 0.02), point(300.0, 150.0)
     search = SearchRange(0.03, 0.01, 0.03, 1000, ((7, 1.0), (5, 0.3), (5, 0.1)))
     found = refine(guess, find_ridges(drawn_road(truth), guess), WIDTH, BOTTOM, search)
-    rows, places = np.array([200.0, 260.0, 340.0]), np.array(PLACES)
-    error = found.columns(places, rows) - truth.columns(places, rows)
-    before = guess.columns(places, rows) - truth.columns(places, rows)
-    # A shift of all rows is another place, so only what differs between the rows is an error.
+    rows, positions = np.array([200.0, 260.0, 340.0]), np.array(POSITIONS)
+    error = found.columns(positions, rows) - truth.columns(positions, rows)
+    before = guess.columns(positions, rows) - truth.columns(positions, rows)
+    # A shift of all rows is another position, so only what differs between the rows is an error.
     assert np.abs(error - error.mean(axis=0)).max() < 0.5 * np.abs(before - before.mean(axis=0)).max()
 
 
@@ -81,11 +81,11 @@ def test_without_lines_the_vanishing_point_is_the_usual_one() -> None:
 
 def test_places_and_columns_are_inverse() -> None:
     vanishing = point(310.0, 152.0, 0.02)
-    rows, places = np.array([170.0, 260.0, 359.0]), np.array([-1.5, 0.0, 2.0])
-    columns = vanishing.columns(places, rows)
-    for i, place in enumerate(places.tolist()):
-        np.testing.assert_allclose(vanishing.places(columns[:, i], rows), place, atol=1e-9)
-    np.testing.assert_allclose(vanishing.curves(places).x(rows), columns.T, atol=1e-9)
+    rows, positions = np.array([170.0, 260.0, 359.0]), np.array([-1.5, 0.0, 2.0])
+    columns = vanishing.columns(positions, rows)
+    for i, position in enumerate(positions.tolist()):
+        np.testing.assert_allclose(vanishing.positions(columns[:, i], rows), position, atol=1e-9)
+    np.testing.assert_allclose(vanishing.curves(positions).x(rows), columns.T, atol=1e-9)
 
 
 def test_a_bar_has_the_contrast_to_its_brighter_side() -> None:

@@ -18,7 +18,7 @@ from lanestream.tracking.tracks import Track
 Array = NDArray[np.float64]
 Pairs = list[tuple[int, int]]
 
-PLACES = st.lists(st.floats(-60.0, 60.0), max_size=4)
+POSITIONS = st.lists(st.floats(-60.0, 60.0), max_size=4)
 
 
 def track_at(columns: Array, *, track_id: int | None = 1, variance: float = 9.0, detected: bool = False) -> Track:
@@ -65,16 +65,17 @@ def best_by_brute_force(tracks: list[Track], columns: Array, variances: Array) -
     return best
 
 
-@given(places=PLACES, seen=PLACES, seed=st.integers(0, 1000))
-def test_the_alignment_is_the_best_of_all(places: list[float], seen: list[float], seed: int) -> None:
+@given(positions=POSITIONS, seen=POSITIONS, seed=st.integers(0, 1000))
+def test_the_alignment_is_the_best_of_all(positions: list[float], seen: list[float], seed: int) -> None:
     rng = np.random.default_rng(seed)
     tracks = [
-        track_at(place + rng.normal(0.0, 3.0, MEASURED), variance=float(rng.uniform(1.0, 40.0))) for place in places
+        track_at(position + rng.normal(0.0, 3.0, MEASURED), variance=float(rng.uniform(1.0, 40.0)))
+        for position in positions
     ]
     columns = np.array(seen).reshape(-1, 1) + rng.normal(0.0, 3.0, (len(seen), MEASURED))
     variances = noise(len(seen)) * rng.uniform(0.5, 10.0, (len(seen), 1, 1))
     pairs = associate(tracks, columns, variances)
-    if not places or not seen:
+    if not positions or not seen:
         assert pairs == []
         return
     distance, log_determinant = innovation_distances(
