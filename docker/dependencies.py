@@ -29,7 +29,7 @@ def prune(packages: Path) -> None:
 
 
 def main(environment: Path, extras: list[str]) -> None:
-    """Installs the requirements and removes what is not used."""
+    """Installs the requirements and removes unused files."""
     pip = [sys.executable, "-m", "pip", "--python", environment / "bin/python"]
     subprocess.run([*pip, "install", *requirements(Path("pyproject.toml"), extras)], check=True)
     for packages in environment.glob("lib/python*/site-packages"):

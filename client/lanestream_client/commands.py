@@ -273,7 +273,7 @@ def _open_service(
     reconnect: float | None = None,
     **in_process: Any,
 ) -> Iterator[LaneService]:
-    """Opens a client of the service at `url`, or loads an engine of this process if there is no URL."""
+    """Opens a client of the service at `url`, or of an engine in this process if `url` is empty."""
     if not url:
         key_was_given = click.get_current_context().get_parameter_source("api_key") is ParameterSource.COMMANDLINE
         if key_was_given or reconnect is not None:

@@ -157,14 +157,14 @@ class InProcessClient:
 
         Raises NoDetectorError if the detector is not loaded.
         """
-        del mode, session  # no frame waits here that a newer one could replace, and there is no log of streams
+        del mode, session  # frames are never queued, so no mode applies; streams are not logged
         return InProcessStream(self._engine.open_camera(horizon, detector, camera), as_source_frames(frames))
 
 
 class InProcessStream:
     """The results of one stream, to be iterated over once. `summary` is set afterwards.
 
-    There is no connection, so `ready` stays None and `reconnects` stays 0.
+    Without a connection, `ready` stays None and `reconnects` stays 0.
     """
 
     ready: ReadyMessage | None = None
