@@ -366,7 +366,10 @@ def compare(
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Returns the report of the whole comparison; `say` is called with a line on each step. Raises CompareError."""
-    base_revision = _git("rev-parse", "--verify", f"{revision}^{{commit}}")
+    try:
+        base_revision = _git("rev-parse", "--verify", f"{revision}^{{commit}}")
+    except CompareError as error:
+        raise CompareError(f"{revision} is not a commit of this repository: give a hash, a tag or a branch") from error
     clips = [read_frames(path, frames) for path in paths]
     with worktree(base_revision) as folder, tempfile.TemporaryDirectory() as logs:
         checkouts = {name: Checkout(name, path) for name, path in zip(SIDES, (folder, ROOT), strict=True)}

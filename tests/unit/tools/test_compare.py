@@ -82,4 +82,4 @@ def test_an_unknown_revision_is_an_error_in_one_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["--base", "no-such-revision", str(tmp_path)])
     assert result.exit_code == 1
     assert result.output.count("\n") == 1
-    assert result.output.startswith("Error: git rev-parse: ")
+    assert "is not a commit of this repository" in result.output
