@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: bench soak evaluate ablation models demo serve train-toy test lint asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: bench soak evaluate ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -91,13 +91,24 @@ fuzz: $(DEV_READY)
 	$(BIN)/python tests/fuzz.py decoder -max_total_time=$(FUZZ_S) -print_final_stats=1
 	$(BIN)/python tests/fuzz.py messages -max_total_time=$(FUZZ_S) -print_final_stats=1
 
+LOCK = $(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
+  --custom-compile-command 'make lock'
+BUILD_REQUIREMENTS := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")
+
+# Locks the packages of the images, and those that build our own: the newest versions that pyproject.toml allows.
+lock: | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster -o docker/requirements-cpu.txt pyproject.toml
+	$(LOCK) --extra service --extra gpu --extra cluster -o docker/requirements-gpu.txt pyproject.toml
+	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
+
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
 
 # Podman's own image format can't store a health check.
 image:
 	$(ENGINE) build $(if $(findstring podman,$(ENGINE)),--format docker) -f docker/Dockerfile --target $(VARIANT) \
-	  --build-arg VERSION=$(VERSION) --build-arg REVISION=$(REVISION) -t lanestream:$(VARIANT) .
+	  $(if $(BASE_IMAGE),--build-arg BASE_IMAGE=$(BASE_IMAGE)) --build-arg VERSION=$(VERSION) --build-arg REVISION=$(REVISION) -t lanestream:$(VARIANT) .
 
 image-test: $(RUN_READY)
 	$(BIN)/python tools/image_check.py --target $(VARIANT)

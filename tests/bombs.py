@@ -92,13 +92,13 @@ def jpeg_behind_a_marker() -> bytes:
     return b"\xff\xd8" + jpeg_segment(0x01, hidden) + fakes.image_file()[2:]
 
 
-def jpeg_of_scans(scans: int) -> bytes:
-    """A progressive JPEG of 4096 x 2304 whose scans are empty."""
+def jpeg_of_scans(scans: int, width: int = 4096, height: int = 2304) -> bytes:
+    """A progressive JPEG whose scans are empty."""
     parts = b"".join(bytes([number, 0x11, 0]) for number in (1, 2, 3))
     tables = jpeg_segment(0xDB, bytes(1) + bytes([1] * 64))
     for kind, symbol in ((0x00, 0x00), (0x10, 0xE0)):
         tables += jpeg_segment(0xC4, bytes([kind, 1]) + bytes(15) + bytes([symbol]))
-    frame = jpeg_segment(0xC2, struct.pack(">BHHB", 8, 2304, 4096, 3) + parts)
+    frame = jpeg_segment(0xC2, struct.pack(">BHHB", 8, height, width, 3) + parts)
     first = jpeg_segment(0xDA, bytes([3, 1, 0, 2, 0, 3, 0, 0, 0, 1])) + bytes(10)
     again = jpeg_segment(0xDA, bytes([3, 1, 0, 2, 0, 3, 0, 0, 0, 0x10])) + bytes(1)
     return b"\xff\xd8" + tables + frame + first + (scans - 1) * again + b"\xff\xd9"
@@ -131,7 +131,7 @@ def huge_webp() -> bytes:
 # Each bomb with a part of the error message, or with an empty one if it is an ordinary image with ballast.
 BOMBS: Final[Mapping[str, tuple[Callable[[], bytes], str]]] = {
     "png: huge": (huge_png, "12000 x 12000, 144,000,000 pixels"),
-    "png: far more data than pixels": (lambda: png(320, 180, zeros(1100 << 20)), "far more data than pixels"),
+    "png: far more data than pixels": (lambda: png(320, 180, zeros(140 << 20)), "far more data than pixels"),
     "png: texts that inflate": (
         lambda: png(320, 180, extra=200 * png_chunk(b"zTXt", b"x\0\0" + zeros(7 << 20))),
         "",
@@ -147,7 +147,8 @@ BOMBS: Final[Mapping[str, tuple[Callable[[], bytes], str]]] = {
     "jpeg: huge": (lambda: resized_jpeg(65_000, 65_000), "4,225,000,000 pixels"),
     "jpeg: huge, behind a marker": (jpeg_behind_a_marker, "64,000,000 pixels"),
     "jpeg: huge, and a second size": (lambda: resized_jpeg(64, 8000)[:-2] + resized_jpeg(8000, 8000), "elongated"),
-    "jpeg: empty scans": (lambda: jpeg_of_scans(101), "more than 100 scans"),
+    "jpeg: empty scans": (lambda: jpeg_of_scans(101, 320, 180), "more than 100 scans"),
+    "jpeg: empty scans of many pixels": (lambda: jpeg_of_scans(11), "more than 10 scans"),
     "jpeg: two million segments": (
         lambda: b"\xff\xd8" + 2_000_000 * jpeg_segment(0xFE, b"") + fakes.image_file()[2:],
         "2,000 segments",

@@ -1,4 +1,4 @@
-"""A real Redis on a free port. It needs `redis-server`."""
+"""A real Redis on a free port, which can be restarted. It needs `redis-server`."""
 
 from __future__ import annotations
 
@@ -14,30 +14,53 @@ import fakes
 import pytest
 
 
+class RedisServer:
+    """A Redis that keeps nothing on disk. It closes connections that are idle for `idle_s` seconds, unless 0."""
+
+    def __init__(self, folder: Path, idle_s: int = 0) -> None:
+        executable = shutil.which("redis-server")
+        if executable is None:
+            pytest.fail("redis-server is not installed (on Debian: apt install redis-server)")
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port: int = free.getsockname()[1]
+        self.url = f"redis://127.0.0.1:{self.port}/0"
+        options = {"port": self.port, "bind": "127.0.0.1", "save": "", "appendonly": "no", "dir": folder}
+        options["timeout"] = idle_s
+        self._command = [executable, *(part for name, value in options.items() for part in (f"--{name}", str(value)))]
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Starts it, without any sessions, and waits until it answers."""
+        self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL)
+        end = time.monotonic() + fakes.WAIT_S
+        while time.monotonic() < end:
+            with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), 1.0) as connection:
+                connection.sendall(b"PING\r\n")
+                if connection.recv(16).startswith(b"+PONG"):
+                    return
+            time.sleep(0.01)
+        pytest.fail("redis-server did not start")
+
+    def stop(self) -> None:
+        """Ends it. Its sessions are lost."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+
+@contextmanager
+def running_redis(folder: Path, idle_s: int = 0) -> Iterator[RedisServer]:
+    """Starts a Redis and yields it."""
+    server = RedisServer(folder, idle_s)
+    try:
+        server.start()
+        yield server
+    finally:
+        server.stop()
+
+
 @contextmanager
 def redis_server(folder: Path) -> Iterator[str]:
-    """Starts a Redis that keeps nothing on disk and yields its URL."""
-    executable = shutil.which("redis-server")
-    if executable is None:
-        pytest.fail("redis-server is not installed (on Debian: apt install redis-server)")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    options = {"--port": str(port), "--bind": "127.0.0.1", "--save": "", "--appendonly": "no", "--dir": str(folder)}
-    command = [executable, *(part for option in options.items() for part in option)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
-        try:
-            _wait_for(port)
-            yield f"redis://127.0.0.1:{port}/0"
-        finally:
-            server.terminate()
-
-
-def _wait_for(port: int) -> None:
-    end = time.monotonic() + fakes.WAIT_S
-    while time.monotonic() < end:
-        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as connection:
-            connection.sendall(b"PING\r\n")
-            if connection.recv(16).startswith(b"+PONG"):
-                return
-        time.sleep(0.01)
-    pytest.fail("redis-server did not start")
+    """Starts a Redis and yields its URL."""
+    with running_redis(folder) as server:
+        yield server.url

@@ -90,7 +90,7 @@ class ExpiredError(LanestreamError):
 
 
 class BusyError(LanestreamError):
-    """The service or the caller has reached its session limit."""
+    """The service or the caller has reached a limit: of sessions, of single images, or of memory for them."""
 
     code = "busy"
 
@@ -144,7 +144,7 @@ class LostError(LanestreamError):
 
 
 class WorkerLostError(LanestreamError):
-    """The worker process that had the frame crashed. The frame is lost; the service starts another process."""
+    """The worker process that had the frame crashed, or hung on it. The service starts another process."""
 
     code = "worker_lost"
 

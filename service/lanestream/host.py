@@ -9,8 +9,10 @@ import ctypes
 import math
 import os
 import platform
+import resource
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -94,6 +96,22 @@ def memory_limit(root: Path = _ROOT) -> float | None:
         *_cgroup_limits(root, "memory", _MEMORY_VERSION_1, _read_memory_limit),
     ]
     return min(limits, default=None)
+
+
+def memory() -> float:
+    """Returns the memory that this process may use in bytes: the container's limit, or what the machine has."""
+    installed = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    limit = memory_limit()
+    return installed if limit is None else min(installed, limit)
+
+
+def raise_open_files() -> int:
+    """Raises the limit of open files to what the system allows, and returns it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != hard:
+        with suppress(ValueError, OSError):  # macOS allows fewer than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 def cpu_info(path: Path = Path("/proc/cpuinfo")) -> dict[str, str]:

@@ -1,11 +1,19 @@
 """The service's logging: one handler for all loggers, as text or JSON lines, without secrets.
 
-Records about a session or a frame name it with `extra={"session": ..., "seq": ...}`.
+Logging never waits for whoever reads standard error: see BackgroundHandler. Records about a session or a frame name it
+with `extra={"session": ..., "seq": ...}`.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import select
+import stat
+import sys
+import threading
+from collections import deque
+from contextlib import suppress
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,6 +32,100 @@ _LIBRARY_FIELDS: Final = ("color_message", "websocket")
 _ACCESS: Final = "uvicorn.access"
 _ACCESS_ARGUMENTS: Final = 5
 _PROBES: Final = frozenset({"/healthz", "/readyz", "/metrics"})
+# About 8,000 lines. A limit in bytes, because callers determine the length of some lines.
+_QUEUE_BYTES: Final = 1 << 20
+# The lines of several processes stay whole in one pipe if no write is longer than this.
+_WRITE_BYTES: Final = select.PIPE_BUF
+_FLUSH_S: Final = 0.5
+
+
+class BackgroundHandler(logging.Handler):
+    """Writes records to standard error in its own thread, so that a reader that stops reading delays nothing else.
+
+    Lines wait in a queue. Records that do not fit into it are dropped and counted, and a line where they are missing
+    says how many.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._descriptor = _nonblocking_stderr()
+        self._lines: deque[bytes | None] = deque()  # None stands for the line that reports dropped records
+        self._queued = 0
+        self._dropped = 0
+        self._unreported = 0
+        self._closed = False
+        self._changed = threading.Condition()
+        threading.Thread(target=self._work, name="lanestream-log", daemon=True).start()
+
+    @property
+    def dropped(self) -> int:
+        """The number of records that were dropped."""
+        return self._dropped
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queues a record, formatted here because its arguments may change later."""
+        try:
+            line = self._line(record)
+        except Exception:
+            self.handleError(record)
+            return
+        with self._changed:
+            if self._queued + len(line) <= _QUEUE_BYTES:
+                self._lines.append(line)
+                self._queued += len(line)
+                self._changed.notify_all()
+                return
+            self._dropped += 1
+            if not self._unreported:
+                self._lines.append(None)
+                self._changed.notify_all()
+            self._unreported += 1
+
+    def flush(self) -> None:
+        """Waits until all queued lines are written, for at most half a second."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._lines, _FLUSH_S)
+
+    def close(self) -> None:
+        """Ends the thread after it has written the queued lines; does not wait for it."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        super().close()
+
+    def _work(self) -> None:
+        while lines := self._next_lines():
+            try:
+                _write(self._descriptor, b"".join(lines))
+                failed = 0
+            except OSError:
+                failed = len(lines)
+            with self._changed:
+                for _ in lines:
+                    self._queued -= len(self._lines.popleft() or b"")
+                self._dropped += failed
+                self._changed.notify_all()
+
+    def _next_lines(self) -> list[bytes]:
+        """Waits for lines and returns those of the next write, which stay in the queue; none after `close`."""
+        lines: list[bytes] = []
+        with self._changed:
+            self._changed.wait_for(lambda: self._lines or self._closed)
+            room = _WRITE_BYTES
+            for each in self._lines:
+                if lines and (each is None or len(each) > room):
+                    break
+                lines.append(self._report() if each is None else each)
+                room -= len(lines[-1])
+        return lines
+
+    def _report(self) -> bytes:
+        count, self._unreported = self._unreported, 0
+        arguments = ("%d log records were dropped because standard error was not read in time", (count,), None)
+        return self._line(logging.LogRecord(__name__, logging.WARNING, __file__, 0, *arguments))
+
+    def _line(self, record: logging.LogRecord) -> bytes:
+        return (self.format(record) + "\n").encode(errors="backslashreplace")
 
 
 class TextLogFormatter(logging.Formatter):
@@ -101,7 +203,7 @@ def log_config(settings: Settings) -> dict[str, Any]:
         },
         "handlers": {
             "stderr": {
-                "class": "logging.StreamHandler",
+                "()": BackgroundHandler,
                 "formatter": "lines",
                 "filters": ["queries", "false_alarms", "probes"],
             },
@@ -112,6 +214,44 @@ def log_config(settings: Settings) -> dict[str, Any]:
             "uvicorn": {"level": library_level.upper()},
         },
     }
+
+
+def dropped_records() -> int:
+    """Returns the number of log records that this process has dropped, because standard error was not read in time."""
+    return sum(handler.dropped for handler in logging.getLogger().handlers if isinstance(handler, BackgroundHandler))
+
+
+def flush_logs() -> None:
+    """Waits until queued log records are written, for at most half a second."""
+    for handler in logging.getLogger().handlers:
+        handler.flush()
+
+
+def _nonblocking_stderr() -> int:
+    """Returns the descriptor of standard error, writes to which fail from now on if it is a full pipe.
+
+    Without this, image libraries, which report broken images there, would wait for the reader.
+    """
+    if sys.__stderr__ is None:  # it was closed before the start, and its number may belong to another file
+        return os.open(os.devnull, os.O_WRONLY)
+    descriptor = sys.__stderr__.fileno()
+    if stat.S_ISFIFO(os.fstat(descriptor).st_mode):
+        # The mode of an open pipe belongs to all processes that share it, so this opens the pipe once more. If the
+        # system does not allow that, only this handler does not wait.
+        with suppress(OSError):
+            opened = os.open(f"/proc/self/fd/{descriptor}", os.O_WRONLY | os.O_NONBLOCK)
+            os.dup2(opened, descriptor)
+            os.close(opened)
+    return descriptor
+
+
+def _write(descriptor: int, data: bytes) -> None:
+    """Writes all of `data`, and waits until that is possible."""
+    while data:
+        try:
+            data = data[os.write(descriptor, data) :]
+        except BlockingIOError:
+            select.select([], [descriptor], [])
 
 
 def _remove_query(value: object) -> object:

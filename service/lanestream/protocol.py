@@ -20,6 +20,9 @@ SUBPROTOCOL: Final = "lanestream.v1"
 KEY_SUBPROTOCOL: Final = "bearer."
 # Larger JSON numbers are not read the same by every parser (RFC 8259, section 6).
 MAX_SEQ: Final = 2**53 - 1
+# The largest text message that the service reads, and the most values in it: parsing must stay cheap for any text.
+MOST_TEXT_BYTES: Final = 1 << 16
+_MOST_VALUES: Final = 64
 
 Point = tuple[float, float]
 Mode = Literal["latest", "all"]
@@ -277,6 +280,11 @@ _SERVER: Final[TypeAdapter[ServerMessage]] = TypeAdapter(Annotated[ServerMessage
 
 def parse_client_message(text: str) -> ClientMessage:
     """Returns the client message in `text`. Raises ProtocolError if it is malformed."""
+    # An error is built for every unknown field, so their number is limited before.
+    if text.count(",") >= _MOST_VALUES:
+        raise ProtocolError(
+            f"not a valid stream message: it has more than {_MOST_VALUES} values", "see /v1/asyncapi.json"
+        )
     try:
         return _CLIENT.validate_json(text)
     except ValidationError as error:

@@ -13,11 +13,15 @@ from lanestream.detection.interface import Detections, Detector, FrameContext, I
 from lanestream.images.resizing import working_image
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image, Scaling
-from lanestream.tracking.state import TrackerState
+from lanestream.tracking.state import MAX_COUNT, TrackerState, check_range
 from lanestream.tracking.tracker import LaneTracker
 
 # The least weight of a new frame's horizon: bumps should not move the estimate, a minute of driving should.
 _HORIZON_GAIN: Final = 0.1
+# The limits of a saved state: a side of a working image in pixels, and the row of a horizon as a share of the height.
+# Detectors place no horizon lower, because some road must be visible below it.
+_LONGEST_SIDE: Final = 1 << 20
+_HORIZONS: Final = (-1.0, 0.98)
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,15 @@ class SessionState:
     prior_horizon: float | None = None
     evidence: float = 0.0
     tracker: TrackerState = field(default_factory=TrackerState)
+
+    def validate(self) -> None:
+        """Checks a state from outside this process. Raises ValueError, on one line, if no session can have it."""
+        if self.size is not None and not all(0 < side <= _LONGEST_SIDE for side in self.size):
+            raise ValueError(f"a side of the images is not between 1 and {_LONGEST_SIDE} pixels")
+        check_range("horizon", self.horizon, *_HORIZONS)
+        check_range("prior_horizon", self.prior_horizon, *_HORIZONS)
+        check_range("evidence", self.evidence, 0.0, MAX_COUNT)
+        self.tracker.validate()
 
 
 class Session:
@@ -60,7 +73,8 @@ class Session:
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
         """Continues where `state` was taken; `ids_lost` more track ids count as assigned.
 
-        Raises ValueError for an invalid state, and leaves the session as it was.
+        Raises ValueError for an incomplete state, and leaves the session as it was. A state from outside this process
+        needs `SessionState.validate` first, which takes too long for every frame.
         """
         self._tracker = LaneTracker.restored(state.tracker, ids_lost)
         self._size, self._horizon, self._evidence = state.size, state.horizon, state.evidence

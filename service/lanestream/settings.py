@@ -22,7 +22,7 @@ from pydantic_settings import (
 )
 
 from lanestream.errors import SettingsError
-from lanestream.host import network_threads, processors
+from lanestream.host import memory, network_threads, processors
 from lanestream.images.decoding import MOST_PIXELS, ImageLimits
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES, RuntimeOptions
 from lanestream.keys import ApiKey, parse_keys
@@ -35,8 +35,17 @@ if TYPE_CHECKING:
 _PREFIX: Final = "LANESTREAM_"
 _ORIGIN: Final = re.compile(r"[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 _MASK: Final = "***"
-# The parts of a URL that may contain a password: before the host, or in the query.
-_URL_SECRETS: Final = re.compile(r"(?<=://)[^/\s]+(?=@)|(?<=\?).+")
+_MOST_BUFFERED_BYTES: Final = 256 << 20
+_FEWEST_CONNECTIONS: Final = 1024
+# Room for the single requests of an address that has all its sessions open.
+_CONNECTIONS_BESIDE_SESSIONS: Final = 64
+# A Redis URL in which only what is before the last @ and the query may be secret. A ? or # in a password looks like the
+# start of a query or a fragment, so this matches no URL in which an @ follows one of them.
+_REDIS_URL: Final = re.compile(
+    r"(?P<scheme>rediss?://)(?P<user>[^?#]*@)?"
+    r"(?P<address>([\w.-]+|\[[\dA-Fa-f:.]+\])(:\d{1,5})?(/\d{0,3})?)(?P<query>\?[^@]*)?",
+    re.ASCII,
+)
 
 
 def _keys(value: object) -> object:
@@ -109,7 +118,28 @@ class Settings(BaseSettings):
     )
     max_sessions: int = Field(default=64, ge=1, description="Maximum number of concurrent streams and single images.")
     max_sessions_per_caller: int | None = Field(
-        default=None, ge=1, description="Maximum number of concurrent sessions per key, or per host without keys."
+        default=None,
+        ge=1,
+        description="Maximum number of concurrent sessions per key, or per host without keys; if not set, half of "
+        "max_sessions.",
+    )
+    max_connections: int | None = Field(
+        default=None,
+        ge=2,
+        description="Maximum number of TCP connections; if not set, twice max_sessions, at least 1024.",
+    )
+    max_connections_per_address: int | None = Field(
+        default=None,
+        ge=1,
+        description="Maximum number of TCP connections of one address that is not a trusted proxy; if not set, a "
+        "quarter of max_connections, and more than max_sessions_per_caller.",
+    )
+    max_buffered_bytes: int | None = Field(
+        default=None,
+        ge=1 << 20,
+        description="Memory in bytes for received images and unsent pictures, a quarter of it for one caller; if not "
+        "set, "
+        "an eighth of the memory, at most 256 MB.",
     )
     credits: int = Field(
         default=8, ge=1, le=256, description="Maximum number of unanswered frames of a stream in mode `all`."
@@ -129,6 +159,9 @@ class Settings(BaseSettings):
         description="Time limit in seconds for the head of a request, and for the first message of a stream.",
     )
     body_s: float = Field(default=30.0, gt=0.0, description="Time limit in seconds for the body of a single request.")
+    send_s: float = Field(
+        default=10.0, gt=0.0, description="A peer that reads nothing for this many seconds is disconnected."
+    )
     idle_s: float = Field(default=60.0, gt=0.0, description="A stream that is idle for this many seconds is closed.")
     session_s: float = Field(
         default=86_400.0, gt=0.0, description="Maximum age of a session in seconds, over all its sockets."
@@ -199,11 +232,35 @@ class Settings(BaseSettings):
         return self.threads or (1 if processes > 1 else processors() + 1)
 
     @property
+    def connections(self) -> int:
+        """The maximum number of TCP connections."""
+        return self.max_connections or max(_FEWEST_CONNECTIONS, 2 * self.max_sessions)
+
+    @property
+    def connections_per_address(self) -> int:
+        """The maximum number of TCP connections of one address."""
+        default = max(self.connections // 4, self.sessions_per_caller + _CONNECTIONS_BESIDE_SESSIONS)
+        return min(self.max_connections_per_address or default, self.connections)
+
+    @property
+    def sessions_per_caller(self) -> int:
+        """The maximum number of sessions of one caller."""
+        return self.max_sessions_per_caller or max(1, self.max_sessions // 2)
+
+    @property
+    def buffered_bytes(self) -> int:
+        """The memory for received images and unsent pictures in bytes."""
+        if self.max_buffered_bytes is not None:
+            return self.max_buffered_bytes
+        # A caller gets a quarter of it, and any accepted message must fit into that.
+        return max(min(_MOST_BUFFERED_BYTES, int(memory() / 8)), 8 * self.max_bytes)
+
+    @property
     def session_limits(self) -> SessionLimits:
         """The limits of all sessions."""
         return SessionLimits(
             sessions=self.max_sessions,
-            sessions_per_caller=self.max_sessions_per_caller,
+            sessions_per_caller=self.sessions_per_caller,
             session_s=self.session_s,
             resume_s=self.resume_s,
             idle_s=self.idle_s,
@@ -309,8 +366,17 @@ def _plain(value: object) -> object:
     if isinstance(value, ApiKey):
         return f"{value.name}:{_MASK}"
     if isinstance(value, SecretStr):
-        return _URL_SECRETS.sub(_MASK, value.get_secret_value())
+        return _masked_url(value.get_secret_value())
     return str(value) if isinstance(value, Path) else value
+
+
+def _masked_url(url: str) -> str:
+    """Returns a Redis URL with its secrets masked; any other text, which may be secret as a whole, is masked whole."""
+    match = _REDIS_URL.fullmatch(url)
+    if match is None:
+        return _MASK
+    user, query = match["user"] and f"{_MASK}@", match["query"] and f"?{_MASK}"
+    return f"{match['scheme']}{user or ''}{match['address']}{query or ''}"
 
 
 def _lower_first(message: str) -> str:

@@ -279,6 +279,28 @@ def test_sessions_belong_to_a_key_and_are_limited_per_key(serve: Serve) -> None:
         assert start(again, resume_token=token)["resumed"] is True
 
 
+def test_a_forwarded_address_counts_only_if_it_comes_from_a_trusted_proxy(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def answers(url: str) -> list[str]:
+        stream_url = f"{url.replace('http', 'ws')}/v1/stream"
+        with (
+            connect(stream_url, additional_headers={"X-Forwarded-For": "192.0.2.1"}) as one,
+            connect(stream_url, additional_headers={"X-Forwarded-For": "192.0.2.2"}) as other,
+        ):
+            return [start(one)["type"], start(other)["type"]]
+
+    monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
+    assert answers(serve(fakes.engine(), max_sessions_per_caller=1)) == ["ready", "error"]
+    monkeypatch.setenv("FORWARDED_ALLOW_IPS", "127.0.0.0/8")
+    assert answers(serve(fakes.engine(), max_sessions_per_caller=1)) == ["ready", "ready"]
+
+
+@pytest.mark.parametrize("path", ["/redoc", "/docs/oauth2-redirect/../redoc"])
+def test_no_page_loads_scripts_from_elsewhere(url: str, path: str) -> None:
+    assert httpx.get(url + path).status_code == 404
+
+
 def log_lines(arguments: list[str], settings: dict[str, str], use: Callable[[str], None]) -> list[str]:
     """Returns the lines that `lanestream serve` logs while `use` is called with its URL."""
     command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu", *arguments]

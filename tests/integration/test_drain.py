@@ -6,7 +6,7 @@ import json
 import re
 import signal
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import fakes
 import httpx
 import pytest
 from processes import service
+from rawclient import PING, connect, frame, open_stream, send_endlessly
 from redisserver import redis_server
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from wsclient import receive, receive_close, send_message, stream
@@ -127,3 +128,35 @@ def test_a_draining_service_refuses_new_work_and_finishes_accepted_frames() -> N
         assert receive_close(socket)[0] == 1012
     thread.join(fakes.WAIT_S)
     assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
+def test_each_signal_drains(number: signal.Signals) -> None:
+    with service() as (process, url), stream(url, mode="all") as socket:
+        socket.send(fakes.image_file(width=640, height=360))
+        assert receive(socket)["type"] == "lanes"
+        process.send_signal(number)
+        assert receive(socket)["type"] == "draining"
+        assert receive_close(socket)[0] == 1012
+        assert process.wait(fakes.WAIT_S) in (0, -number)
+
+
+def test_a_second_interrupt_ends_the_service_at_once_and_without_a_traceback() -> None:
+    with service(drain_s=600) as (process, url), stream(url, mode="all") as socket:
+        process.send_signal(signal.SIGINT)
+        assert receive(socket)["type"] == "draining"
+        process.send_signal(signal.SIGINT)
+        process.wait(fakes.WAIT_S)
+        assert process.stderr is not None
+        assert "Traceback" not in process.stderr.read()
+
+
+def test_clients_that_never_read_do_not_delay_the_stop() -> None:
+    with service(drain_s=0.5) as (process, url), ExitStack() as stack:
+        for _ in range(3):
+            silent = stack.enter_context(connect(url, read_buffer=4096))
+            open_stream(silent)
+            silent.settimeout(1.0)
+            send_endlessly(silent, 1000 * frame(PING, bytes(125)), limit=1 << 26)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(fakes.WAIT_S) in (0, -signal.SIGTERM)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import signal
-import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import fakes
 import pytest
 from processes import service
 from redisserver import redis_server
+from tcpproxy import tcp_proxy
 
 from lanestream.protocol import EgoModel
 from lanestream_client import LaneClient, SourceFrame, StreamResult
@@ -21,55 +20,6 @@ from lanestream_client import LaneClient, SourceFrame, StreamResult
 STREAMS = 4
 IN_FLIGHT = 2
 SLOW_WAIT_S = 6 * fakes.WAIT_S  # loading and running real networks is slow when other tests run in parallel
-
-
-class TcpProxy:
-    """Forwards connections to a service until they are cut."""
-
-    def __init__(self, listener: socket.socket, url: str) -> None:
-        host, _, port = url.removeprefix("http://").partition(":")
-        self._target = (host, int(port))
-        self._listener = listener
-        self._sockets: list[socket.socket] = []
-        self.url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-
-    def run(self) -> None:
-        with suppress(OSError):  # raised when the listener is closed
-            while True:
-                ends = [self._listener.accept()[0], socket.create_connection(self._target)]
-                self._sockets += ends
-                for source, sink in (ends, ends[::-1]):
-                    threading.Thread(target=self._forward, args=(source, sink)).start()
-
-    def cut(self) -> None:
-        """Breaks all open connections."""
-        for end in self._sockets:
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-            end.close()
-        self._sockets.clear()
-
-    @staticmethod
-    def _forward(source: socket.socket, sink: socket.socket) -> None:
-        with suppress(OSError):
-            while data := source.recv(65536):
-                sink.sendall(data)
-        with suppress(OSError):
-            sink.shutdown(socket.SHUT_RDWR)
-
-
-@contextmanager
-def tcp_proxy(url: str) -> Iterator[TcpProxy]:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        proxy = TcpProxy(listener, url)
-        thread = threading.Thread(target=proxy.run)
-        thread.start()
-        try:
-            yield proxy
-        finally:
-            proxy.cut()
-            listener.shutdown(socket.SHUT_RDWR)
-            thread.join(fakes.WAIT_S)
 
 
 def frames(count: int, image: bytes | None = None) -> Iterator[SourceFrame]:
@@ -83,7 +33,8 @@ def track_ids(results: list[StreamResult]) -> set[int]:
 
 @pytest.mark.parametrize("mode", ["all", "latest"])
 def test_track_ids_survive_broken_connections(url: str, mode: str) -> None:
-    with tcp_proxy(url) as proxy, LaneClient(proxy.url, in_flight=3) as client:
+    port = int(url.rpartition(":")[2])
+    with tcp_proxy(port) as proxy, LaneClient(f"http://127.0.0.1:{proxy.port}", in_flight=3) as client:
         stream = client.stream(frames(60), mode=mode, session="cut-off")
         results = []
         for result in stream:

@@ -145,6 +145,17 @@ def test_a_stream_is_counted_frame_by_frame(serve: Serve) -> None:
     assert value(metrics, "lane_frames_received_total") == dropped + value(metrics, "lane_frames_processed_total")
 
 
+def test_close_codes_of_clients_do_not_add_series(serve: Serve) -> None:
+    url = serve(fakes.engine())
+    for code in (1001, 3000, 3001, 4444, 4999):
+        with stream(url) as socket:
+            socket.close(code)
+    closes = {
+        dict(labels)["code"]: count for (name, labels), count in samples(url).items() if name == "lane_ws_closes_total"
+    }
+    assert closes == {"1001": 1, "other": 4}
+
+
 def test_frames_of_a_disconnected_client_are_counted(serve: Serve) -> None:
     network = fakes.GatedModel()
     url = serve(fakes.engine(network))

@@ -74,7 +74,7 @@ def test_lanes_are_drawn_on_request(url: str, accept: str, kind: bytes) -> None:
 
 
 def test_other_media_types_are_refused(url: str) -> None:
-    for accept in ("text/html", "x" * 30_000):
+    for accept in ("text/html", "x" * 7_900):
         refused = detect(url, fakes.image_file(), headers={"accept": accept})
         assert problem(refused) == (406, "not_acceptable")
         assert len(refused.text) < 400
@@ -152,7 +152,13 @@ def test_the_loaded_network_is_reported(url: str) -> None:
         "models": [{**network, "sha256": "fa4e", "metadata": {"kind": "fake"}}]
     }
     assert httpx.get(f"{url}/healthz").json() == {"status": "alive"}
-    assert httpx.get(f"{url}/readyz").json() == {"status": "ready", "provider": "cpu", "networks": [network]}
+    assert httpx.get(f"{url}/readyz").json() == {
+        "status": "ready",
+        "provider": "cpu",
+        "networks": [network],
+        "store": "memory",
+        "store_reachable": True,
+    }
 
 
 def test_all_networks_are_reported_the_default_first(both_url: str) -> None:

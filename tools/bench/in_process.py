@@ -135,8 +135,8 @@ class InProcessCameras:
         session, seq = pool.open_session(detector=self.request.detector), 0
         while True:
             started = time.monotonic()
-            async with pool.admit():
-                await pool.run(session, EncodedFrame(self._jpeg(number, seq), seq / FPS, started))
+            async with pool.admit("bench") as slot:
+                await pool.run(session, EncodedFrame(self._jpeg(number, seq), seq / FPS, started), slot)
             self._add_reply(number, started)
             seq += 1
 

@@ -42,6 +42,8 @@ def create_app(engine: Engine | None, settings: Settings, draw: DrawLanes | None
         title="Lanestream",
         version=__version__,
         description="Camera frames in, tracked lane lines out. Streams of frames go to the WebSocket `/v1/stream`.",
+        # Its page loads scripts from another site.
+        redoc_url=None,
         lifespan=lifespan,
     )
     app.state.service = service

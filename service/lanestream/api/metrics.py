@@ -12,6 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.registry import Collector
 
+from lanestream.api.connections import CUT_REASONS, CutReason
 from lanestream.errors import (
     BusyError,
     DrainingError,
@@ -22,6 +23,7 @@ from lanestream.errors import (
     OverrunError,
     RateError,
 )
+from lanestream.workers.pool import WorkerEvent
 
 if TYPE_CHECKING:
     from lanestream.inference.batcher import BatchReport
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
 
 DropReason = Literal["superseded", "expired", "overload", "decode_error", "too_large", "rate", "disconnected", "error"]
 ResumeResult = Literal["resumed", "unknown", "refused"]
+
+# The close codes that this service and ordinary clients send (RFC 6455, section 7.4.1); any other counts as `other`.
+_CLOSE_CODES: Final = frozenset({*range(1000, 1004), *range(1005, 1015), 4001, 4002, 4003})
 
 MEDIA_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
@@ -66,8 +71,23 @@ class Metrics:
         self._refusals = self._counter("lane_refusals_total", "Errors sent to clients.", "code")
         self._resumed = self._counter("lane_sessions_resumed_total", "Attempts to resume a session.", "result")
         self._closes = self._counter("lane_ws_closes_total", "WebSockets closed, by close code.", "code")
+        self._cuts = self._counter(
+            "lane_connections_cut_total", "Connections closed before their peers were done, by reason.", "reason"
+        )
+        self._worker_events = self._counter(
+            "lane_worker_events_total", "Worker processes that ended, hung, were replaced or did not start.", "event"
+        )
+        self._store_failures = self._counter(
+            "lane_store_failures_total", "Operations of the session store that failed."
+        )
         self._sessions = self._gauge("lane_sessions_active", "Streams with a session.")
         self._tasks = self._gauge("lane_tasks", "Tasks of the event loop.")
+        self._connections = self._gauge("lane_connections", "TCP connections.")
+        self._buffered = self._gauge("lane_buffered_bytes", "Received images and unsent pictures that are kept.")
+        self._store_reachable = self._gauge(
+            "lane_store_reachable", "1 if the last operation of the session store succeeded."
+        )
+        self._log_drops = self._gauge("lane_log_records_dropped", "Log records that were dropped since the start.")
         self._queue = self._gauge("lane_queue_depth", "Inference requests still waiting when the last batch started.")
         self._provider = self._gauge(
             "lane_inference_provider_info",
@@ -99,6 +119,10 @@ class Metrics:
             self._dropped.labels(reason)
         for result in get_args(ResumeResult):
             self._resumed.labels(result)
+        for cut in CUT_REASONS:
+            self._cuts.labels(cut)
+        for event in get_args(WorkerEvent):
+            self._worker_events.labels(event)
 
     def frame_received(self) -> None:
         """Counts a received frame. `frame_processed`, `frame_dropped` or `frame_failed` follows for each."""
@@ -135,9 +159,13 @@ class Metrics:
         """Counts a stream whose session was closed."""
         self._sessions.dec()
 
-    def tasks(self, count: int) -> None:
-        """Sets the number of tasks of the event loop."""
-        self._tasks.set(count)
+    def sample(self, *, tasks: int, connections: int, buffered: int, store_reachable: bool, log_drops: int) -> None:
+        """Sets what is measured when the metrics are read; `buffered` is in bytes."""
+        self._tasks.set(tasks)
+        self._connections.set(connections)
+        self._buffered.set(buffered)
+        self._store_reachable.set(store_reachable)
+        self._log_drops.set(log_drops)
 
     def session_resumed(self, result: ResumeResult) -> None:
         """Counts a `start` with a resume token."""
@@ -145,7 +173,19 @@ class Metrics:
 
     def socket_closed(self, code: int) -> None:
         """Counts a WebSocket closed with `code` by either side."""
-        self._closes.labels(str(code)).inc()
+        self._closes.labels(str(code) if code in _CLOSE_CODES else "other").inc()
+
+    def connection_cut(self, reason: CutReason) -> None:
+        """Counts a connection that was closed before its peer was done."""
+        self._cuts.labels(reason).inc()
+
+    def worker_event(self, event: WorkerEvent) -> None:
+        """Counts an event in the life of the worker processes."""
+        self._worker_events.labels(event).inc()
+
+    def store_failed(self) -> None:
+        """Counts an operation of the session store that failed."""
+        self._store_failures.inc()
 
     def refused(self, code: str) -> None:
         """Counts an error sent to a client."""

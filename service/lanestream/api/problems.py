@@ -63,6 +63,16 @@ async def _handle_http_error(request: Request, error: Exception) -> JSONResponse
     return response
 
 
+def raw_response(status: HTTPStatus, code: str, message: str, hint: str) -> bytes:
+    """Returns an error response as bytes, for a connection that is closed before the application sees its request."""
+    body = Problem(code=code, message=message, hint=hint).model_dump_json().encode()
+    head = (
+        f"HTTP/1.1 {status.value} {status.phrase}\r\n"
+        f"content-type: application/json\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n"
+    )
+    return head.encode() + body
+
+
 def _error_response(error: Exception) -> JSONResponse:
     shown = error_message(error)
     problem = Problem(code=shown.code, message=shown.message, hint=shown.hint)

@@ -17,6 +17,7 @@ from lanestream.api.service import Service
 from lanestream.asyncapi import document
 from lanestream.errors import NotAcceptableError, one_line
 from lanestream.images.decoding import decode
+from lanestream.logs import dropped_records
 from lanestream.messages import lanes_message
 from lanestream.protocol import (
     CameraHeight,
@@ -31,6 +32,9 @@ from lanestream.streaming.session_registry import Caller
 from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
+    from starlette.types import Receive, Scope, Send
+
+    from lanestream.api.byte_budget import Charge
     from lanestream.messages import ProcessedFrame
     from lanestream.streaming.session_registry import OpenSession
     from lanestream.workers.capabilities import DetectorInfo
@@ -43,6 +47,7 @@ router = APIRouter()
 metrics_router = APIRouter()
 
 _JSON: Final = "application/json"
+_PART_BYTES: Final = 1 << 16
 _PICTURES: Final = {"image/jpeg": ".jpg", "image/png": ".png"}
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["schema"]}, "required": ["file"]}}
@@ -75,11 +80,16 @@ class ModelList(BaseModel):
 
 
 class Readiness(BaseModel):
-    """The loaded networks of a service that is ready. `provider` runs the default detector's network, the first one."""
+    """The loaded networks of a service that is ready. `provider` runs the default detector's network, the first one.
+
+    Without its session store the service works, but sessions can't be resumed on other replicas.
+    """
 
     status: Literal["ready"]
     provider: str
     networks: list[NetworkEntry]
+    store: str
+    store_reachable: bool
 
 
 _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
@@ -94,6 +104,30 @@ AUTH_PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     401: {"model": Problem, "description": "The API key is missing or unknown"},
     403: {"model": Problem, "description": "The origin of the web page is not allowed"},
 }
+
+
+class PictureResponse(Response):
+    """A picture, which is sent in parts as the peer reads it, and charged to the caller until it is sent.
+
+    Raises BusyError if it does not fit into what the caller may keep.
+    """
+
+    def __init__(self, picture: bytes, media_type: str, charge: Charge) -> None:
+        super().__init__(picture, media_type=media_type)
+        self._charge = charge
+        charge.set(len(picture))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: ARG002 - the ASGI interface
+        """Sends the response."""
+        try:
+            await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
+            picture = memoryview(self.body)
+            for start in range(0, len(picture), _PART_BYTES):
+                part = bytes(picture[start : start + _PART_BYTES])
+                more = start + _PART_BYTES < len(picture)
+                await send({"type": "http.response.body", "body": part, "more_body": more})
+        finally:
+            self._charge.set(0)
 
 
 async def authenticated(request: Request) -> Caller:
@@ -146,14 +180,17 @@ async def detect(
     # Requests that fail anyway are refused before their body is read, and a slow body does not occupy a session.
     pool.capabilities.select(detector)
     service.sessions.check_limits(caller)
-    data = await service.bodies.read_image(request)
-    with service.sessions.temporary(pool, caller, horizon, detector) as session:
-        frame = await _process(service, session, EncodedFrame(data, 0.0, time.monotonic()))
-    message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
-    if media_type == _JSON:
-        return Response(message.model_dump_json(), media_type=_JSON)
-    picture = await pool.in_thread(_draw_picture, service, data, message, media_type)
-    return Response(picture, media_type=media_type)
+    with service.answering(request, caller):
+        async with service.bodies.image(request, caller.quota) as data:
+            with service.sessions.temporary(pool, caller, horizon, detector) as session:
+                frame = await _process(service, session, caller, data)
+                message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
+                if media_type == _JSON:
+                    return Response(message.model_dump_json(), media_type=_JSON)
+                async with pool.admit(caller.quota) as slot:
+                    picture, cpu_s = await pool.in_thread(_draw_picture, service, data, message, media_type)
+                    slot.charge(cpu_s)
+    return PictureResponse(picture, media_type, service.budget.charge(caller.quota))
 
 
 @router.get("/v1/models", responses={503: _PROBLEMS[503]})
@@ -178,26 +215,40 @@ async def asyncapi() -> dict[str, Any]:
     return document()
 
 
-@public_router.get("/healthz")
-async def healthz() -> dict[str, str]:
-    """Responds while the process is alive."""
+@public_router.get("/healthz", responses={503: _PROBLEMS[503]})
+async def healthz(request: Request) -> dict[str, str]:
+    """Responds with 200 while the process is alive and can replace its workers; with 503 it should be restarted."""
+    _service(request).check_alive()
     return {"status": "alive"}
 
 
 @public_router.get("/readyz", responses={503: _PROBLEMS[503]})
 async def readyz(request: Request) -> Readiness:
     """Responds with 200 once the networks are loaded and warm, until the service is about to stop."""
-    _service(request).check_ready()
-    networks = [NetworkEntry.from_info(info) for info in _service(request).pool.capabilities.detectors]
-    return Readiness(status="ready", provider=networks[0].provider, networks=networks)
+    service = _service(request)
+    service.check_ready()
+    networks = [NetworkEntry.from_info(info) for info in service.pool.capabilities.detectors]
+    return Readiness(
+        status="ready",
+        provider=networks[0].provider,
+        networks=networks,
+        store=service.store_name,
+        store_reachable=service.sessions.store_reachable,
+    )
 
 
 @metrics_router.get("/metrics", response_class=Response, responses={200: {"content": {MEDIA_TYPE: {}}}})
 async def exposition(request: Request) -> Response:
     """Returns the metrics in Prometheus' text format."""
-    metrics = _service(request).metrics
-    metrics.tasks(len(asyncio.all_tasks()))
-    return Response(metrics.exposition(), headers={"content-type": MEDIA_TYPE})
+    service = _service(request)
+    service.metrics.sample(
+        tasks=len(asyncio.all_tasks()),
+        connections=len(service.connections),
+        buffered=service.budget.used,
+        store_reachable=service.sessions.store_reachable,
+        log_drops=dropped_records(),
+    )
+    return Response(service.metrics.exposition(), headers={"content-type": MEDIA_TYPE})
 
 
 def preferred_media_type(accept: str, available: Sequence[str]) -> str | None:
@@ -243,12 +294,14 @@ def _response_media_type(request: Request, service: Service) -> str:
     return media_type
 
 
-async def _process(service: Service, session: OpenSession, image: EncodedFrame) -> ProcessedFrame:
+async def _process(service: Service, session: OpenSession, caller: Caller, data: bytes) -> ProcessedFrame:
     """Returns the lanes of an image. Counts the frame, processed or failed."""
     service.metrics.frame_received()
+    arrived = time.monotonic()
+    image = EncodedFrame(data, 0.0, arrived, arrived + service.settings.body_s)
     try:
-        async with service.pool.admit():
-            frame = await service.pool.run(session.handle, image)
+        async with service.pool.admit(caller.quota) as slot:
+            frame = await service.pool.run(session.handle, image, slot)
     except BaseException as error:
         service.metrics.frame_failed(error)
         raise
@@ -256,11 +309,13 @@ async def _process(service: Service, session: OpenSession, image: EncodedFrame) 
     return frame
 
 
-def _draw_picture(service: Service, data: bytes, message: LanesMessage, media_type: str) -> bytes:
+def _draw_picture(service: Service, data: bytes, message: LanesMessage, media_type: str) -> tuple[bytes, float]:
+    """Returns the image file of a picture, and the processor time that it took in seconds."""
     assert service.draw is not None  # noqa: S101 - pictures are available only with it
+    started = time.thread_time()
     image = decode(data, service.settings.image_limits)
     _, encoded = cv2.imencode(_PICTURES[media_type], service.draw(image, message))
-    return encoded.tobytes()
+    return encoded.tobytes(), time.thread_time() - started
 
 
 def _service(request: Request) -> Service:

@@ -6,9 +6,14 @@ import asyncio
 import errno
 import ipaddress
 import logging
+import os
+import signal
 import socket
-from collections.abc import Callable
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from types import FrameType
 from typing import TYPE_CHECKING, Final
 
 import cv2
@@ -16,9 +21,11 @@ import uvicorn
 
 from lanestream.api.app import create_app
 from lanestream.api.auth import warn_if_open
-from lanestream.api.header_timeout import with_header_timeout
+from lanestream.api.http_connection import HttpConnection
+from lanestream.api.websocket_connection import WebSocketConnection
 from lanestream.errors import SettingsError
-from lanestream.logs import log_config
+from lanestream.host import raise_open_files
+from lanestream.logs import flush_logs, log_config
 from lanestream.workers.ipc import WorkerSetup
 from lanestream.workers.process_pool import ProcessPool
 from lanestream.workers.thread_pool import ThreadPool
@@ -33,6 +40,14 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _BACKLOG: Final = 2048
+# Files that the process needs besides its connections: models, pipes to workers, Redis, logs.
+_OTHER_FILES: Final = 128
+# After a drain, how long uvicorn waits for peers to close their connections.
+_CLOSE_S: Final = 0.5
+# What shells add to the number of the signal by which a process ended.
+_SIGNALED: Final = 128
+# All of them begin a drain. A terminal that is closed sends SIGHUP.
+_STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None = None) -> None:
@@ -44,9 +59,10 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None
     # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
     cv2.setNumThreads(settings.opencv_threads)
     app = create_app(None, settings, draw)
+    app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     listener = listen(settings.host, settings.port)
     server = LanestreamServer(app, settings)
-    with suppress(KeyboardInterrupt), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
+    with server.stopping_on_signals(), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
         runner.run(_serve(server, listener, app, load))
 
 
@@ -64,14 +80,19 @@ def listen(host: str, port: int) -> socket.socket:
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     """Returns the uvicorn configuration for `app`."""
+    service: Service = app.state.service
     return uvicorn.Config(
         app,
-        http=with_header_timeout(settings.handshake_s),
-        ws="websockets-sansio",
+        http=partial(HttpConnection, service.connections),  # type: ignore[arg-type]
+        ws=WebSocketConnection,
         # An image above `max_bytes` costs only that frame. A far larger message closes the socket, not the session.
         ws_max_size=2 * settings.max_bytes,
         # Frames are compressed images: deflate would multiply the work and save nothing.
         ws_per_message_deflate=False,
+        # Without proxies, no header may change the address of a caller.
+        proxy_headers=bool(service.proxies),
+        forwarded_allow_ips=service.proxies or None,
+        timeout_graceful_shutdown=_CLOSE_S,  # type: ignore[arg-type]
         log_config=log_config(settings),
     )
 
@@ -83,10 +104,45 @@ class LanestreamServer(uvicorn.Server):
         super().__init__(server_config(app, settings))
         self._service: Service = app.state.service
 
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leaves the signals to `stopping_on_signals`, which holds for the start and the end of the process, too."""
+        yield
+
+    @contextmanager
+    def stopping_on_signals(self) -> Iterator[None]:
+        """Stops the server on SIGINT, SIGTERM or SIGHUP; ends the process at once on a second SIGINT or SIGTERM.
+
+        After the block the process ends by the first of them, so that its parent sees why it ended.
+        """
+        received: list[int] = []
+
+        def stop(number: int, _: FrameType | None) -> None:
+            if received and number != signal.SIGHUP:
+                flush_logs()
+                os._exit(_SIGNALED + number)
+            received.append(number)
+            self.should_exit = True
+
+        in_main = threading.current_thread() is threading.main_thread()
+        # A process that was started to ignore SIGHUP, by nohup, goes on.
+        handled = [each for each in _STOP_SIGNALS if in_main and signal.getsignal(each) is not signal.SIG_IGN]
+        before = {number: signal.signal(number, stop) for number in handled}
+        try:
+            yield
+        finally:
+            flush_logs()
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        if received and received[0] != signal.SIGINT:
+            signal.raise_signal(received[0])
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drains the streams, then shuts uvicorn down, which closes the sockets."""
         await self._service.drain()
         await super().shutdown(sockets)
+        self._service.connections.abort_all()
+        await asyncio.sleep(0.0)  # so that the event loop closes them
 
 
 async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
@@ -110,10 +166,14 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
 
 async def _start_pool(service: Service, load: Callable[[], Engine]) -> WorkerPool:
     """Returns a warm worker pool: worker processes, or threads of this process if the settings ask for that."""
-    settings, observe = service.settings, service.metrics.batch
+    settings, metrics = service.settings, service.metrics
     if settings.processes == 0:
-        return ThreadPool(
-            await asyncio.to_thread(load), settings.image_limits, settings.threads_per_process(1), observe
-        )
-    setup = WorkerSetup(load, settings.image_limits, settings.opencv_threads, log_config(settings))
-    return await ProcessPool.start(setup, settings.processes, settings.threads_per_process, observe)
+        engine = await asyncio.to_thread(load)
+        return ThreadPool(engine, settings.image_limits, settings.threads_per_process(1), metrics.batch)
+    return await ProcessPool.start(
+        WorkerSetup(load, settings.image_limits, settings.opencv_threads, log_config(settings)),
+        settings.processes,
+        settings.threads_per_process,
+        observe=metrics.batch,
+        observe_worker=metrics.worker_event,
+    )

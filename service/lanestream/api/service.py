@@ -3,27 +3,41 @@
 from __future__ import annotations
 
 import asyncio
+import ipaddress
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final, Protocol
 
 from lanestream.api.auth import Authenticator
+from lanestream.api.byte_budget import ByteBudget
+from lanestream.api.connections import ConnectionLimits, ConnectionTable, connection_of
 from lanestream.api.metrics import Metrics
-from lanestream.api.request_body import BodyReader
+from lanestream.api.request_body import BodyLimits, BodyReader
 from lanestream.errors import DrainingError, NotReadyError
 from lanestream.protocol import Limits
 from lanestream.streaming.session_registry import SessionRegistry
 from lanestream.streaming.stores import open_store
 
 if TYPE_CHECKING:
+    from starlette.requests import HTTPConnection
+
     from lanestream.protocol import LanesMessage
     from lanestream.road.view import Image
     from lanestream.settings import Settings
+    from lanestream.streaming.session_registry import Caller
     from lanestream.workers.pool import WorkerPool
 
 DrawLanes = Callable[["Image", "LanesMessage"], "Image"]
 
 _DRAIN_POLL_S: Final = 0.02
+# An idle connection is kept for this long between two requests.
+_KEEP_ALIVE_S: Final = 5.0
+# Room for what is no frame nor its announcement: `start`, `end` and pongs.
+_CONTROL_MESSAGES_PER_S: Final = 20.0
+# uvicorn's variable: the proxies whose X-Forwarded-For headers are trusted.
+_PROXIES_VARIABLE: Final = "FORWARDED_ALLOW_IPS"
 
 
 class OpenStream(Protocol):
@@ -45,12 +59,23 @@ class Service:
         self.draw = draw
         self.authenticator = Authenticator.from_settings(settings)
         self.metrics = Metrics()
-        self.bodies = BodyReader(settings.max_bytes, settings.max_sessions, settings.body_s)
+        self.budget = ByteBudget(settings.buffered_bytes)
+        self.proxies = os.environ.get(_PROXIES_VARIABLE, "")
+        self.connections = ConnectionTable(
+            _connection_limits(settings), self.budget, proxy_check(self.proxies), self.metrics.connection_cut
+        )
+        self.bodies = BodyReader(
+            BodyLimits(settings.max_bytes, settings.body_s, settings.max_sessions, settings.sessions_per_caller),
+            self.budget,
+        )
         self.streams: set[OpenStream] = set()
         self.draining = False
+        self._requests = 0
         redis_url = settings.redis_url
         self._store = open_store(None if redis_url is None else redis_url.get_secret_value())
-        self.sessions = SessionRegistry(settings.session_limits, self._store)
+        self.sessions = SessionRegistry(
+            settings.session_limits, self._store, on_store_failure=self.metrics.store_failed
+        )
         self._pool: WorkerPool | None = None
 
     @property
@@ -59,6 +84,11 @@ class Service:
         if self._pool is None:
             raise NotReadyError("the networks are still being loaded", "poll /readyz, and try again in a moment")
         return self._pool
+
+    @property
+    def store_name(self) -> str:
+        """The kind of the session store."""
+        return self._store.name
 
     @property
     def limits(self) -> Limits:
@@ -72,12 +102,32 @@ class Service:
         if not self.pool.works:
             raise NotReadyError("the worker processes are restarting", "poll /readyz, and try again in a moment")
 
+    def check_alive(self) -> None:
+        """Raises NotReadyError if worker processes that end are no longer replaced."""
+        if self._pool is not None and self._pool.upkeep_failed:
+            raise NotReadyError("worker processes are no longer replaced", "restart the service; its log has the cause")
+
     def install(self, pool: WorkerPool) -> None:
         """Makes the service ready with a warm worker pool."""
         for detector in pool.capabilities.detectors:
             self.metrics.loaded(detector)
         self.metrics.workers(lambda: pool.pids)
         self._pool = pool
+
+    @contextmanager
+    def answering(self, request: HTTPConnection, caller: Caller) -> Iterator[None]:
+        """Makes `drain` wait for the request that is answered in the block, and keeps its connection open."""
+        connection = connection_of(request.scope)
+        self._requests += 1
+        if connection is not None:
+            connection.identify(caller.quota)
+            connection.protect()
+        try:
+            yield
+        finally:
+            self._requests -= 1
+            if connection is not None:
+                connection.unprotect()
 
     async def drain(self) -> None:
         """Accepts nothing new, notifies the streams and waits until every frame that was accepted is answered.
@@ -88,12 +138,51 @@ class Service:
         for stream in self.streams:
             stream.wake()
         deadline = time.monotonic() + self.settings.drain_s
-        while self.streams and time.monotonic() < deadline:
+        while (self.streams or self._requests) and time.monotonic() < deadline:
             await asyncio.sleep(_DRAIN_POLL_S)
 
     async def close(self) -> None:
         """Stops being ready, and ends threads and processes once they have finished their current work."""
         pool, self._pool = self._pool, None
+        await self.sessions.stop()
         await self._store.close()
         if pool is not None:
             await pool.close()
+
+
+def proxy_check(proxies: str) -> Callable[[str], bool]:
+    """Returns a function that says whether an address is in `proxies`: addresses and networks, or `*` for all.
+
+    Names, which uvicorn accepts for Unix sockets, match no address.
+    """
+    entries = [entry.strip() for entry in proxies.split(",") if entry.strip()]
+    networks = []
+    for entry in entries:
+        with suppress(ValueError):
+            networks.append(ipaddress.ip_network(entry, strict=False))
+
+    def is_proxy(address: str) -> bool:
+        if "*" in entries:
+            return True
+        try:
+            ip = ipaddress.ip_address(address)
+        except ValueError:
+            return False
+        return any(ip in network for network in networks)
+
+    return is_proxy
+
+
+def _connection_limits(settings: Settings) -> ConnectionLimits:
+    return ConnectionLimits(
+        connections=settings.connections,
+        # The others are left to sessions.
+        without_session=max(settings.connections - settings.max_sessions, settings.connections // 2),
+        per_address=settings.connections_per_address,
+        head_s=settings.handshake_s,
+        body_s=settings.body_s,
+        send_s=settings.send_s,
+        keep_alive_s=_KEEP_ALIVE_S,
+        # Each frame may be two messages, and each message counts as four.
+        messages_per_s=4.0 * (2.0 * settings.frames_per_s + _CONTROL_MESSAGES_PER_S),
+    )

@@ -9,17 +9,21 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING, Final
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
+from lanestream.api.connections import connection_of
 from lanestream.api.problems import deny_handshake
 from lanestream.errors import (
+    BusyError,
     EvictedError,
     ExpiredError,
     LanestreamError,
     NoDetectorError,
     ProtocolError,
+    WorkerLostError,
     wire_status,
 )
 from lanestream.messages import lanes_message
@@ -40,6 +44,7 @@ if TYPE_CHECKING:
     from lanestream.messages import ProcessedFrame
     from lanestream.streaming.session_registry import Caller, OpenSession
     from lanestream.streaming.stream_protocol import IncomingFrame
+    from lanestream.workers.admission import Slot
     from lanestream.workers.capabilities import DetectorInfo
 
 router = APIRouter()
@@ -49,6 +54,9 @@ _MAX_REASON_BYTES: Final = 123  # of a close frame, by RFC 6455
 _NORMAL_CLOSURE: Final = 1000
 _SERVICE_RESTART: Final = 1012
 _MIN_WATCH_S: Final = 0.01
+# A stream whose frames were in process when this many workers were lost is ended, and can't be resumed.
+_MOST_WORKER_LOSSES: Final = 3
+_FORGIVEN_AFTER: Final = 100
 
 
 @router.websocket("/v1/stream")
@@ -80,6 +88,12 @@ class StreamConnection:
         self._wake_watcher = asyncio.Event()
         self._evicted = False
         self._close_counted = False
+        self._worker_losses = 0
+        self._answered_at_loss = 0
+        self._connection = connection_of(socket.scope)
+        self._charge = service.budget.charge(caller.quota)
+        if self._connection is not None:
+            self._connection.identify(caller.quota)
 
     def wake(self) -> None:
         """Makes the watcher check the time limits, and whether the service is draining."""
@@ -98,6 +112,7 @@ class StreamConnection:
             await self._end_with(error)
         finally:
             await self._release_session()
+            self._charge.set(0)
             self._service.streams.discard(self)
 
     async def _run_tasks(self) -> None:
@@ -137,14 +152,23 @@ class StreamConnection:
         metrics = self._service.metrics
         metrics.frame_received()
         try:
-            replaced = self._protocol.receive_image(data, now)
+            replaced = self._protocol.receive_image(data, now, self._charge_for(data))
         except LanestreamError as error:
             metrics.frame_failed(error)
             raise
+        self._charge.set(self._protocol.held_bytes)
         for _ in range(replaced):
             metrics.frame_dropped("superseded")
         if self._protocol.state is not StreamState.DRAINED:
             self._ensure_session()
+
+    def _charge_for(self, data: bytes) -> BusyError | None:
+        """Charges the caller for another frame. Returns the error if too much is kept for it already."""
+        try:
+            self._charge.set(self._protocol.held_bytes + len(data))
+        except BusyError as error:
+            return error
+        return None
 
     async def _start(self, message: StartMessage, now: float) -> None:
         # Checked first, so that asking for a detector that is not loaded leaves the stream unchanged.
@@ -181,6 +205,8 @@ class StreamConnection:
 
     def _attach(self, session: OpenSession) -> None:
         self._session = session
+        if self._connection is not None:
+            self._connection.protect()
         session.on_evict = self._evict
         # The time limits of an open stream differ from those of the handshake.
         self.wake()
@@ -215,17 +241,19 @@ class StreamConnection:
     async def _answer_next(self) -> ServerMessage:
         """Waits for a slot in the worker pool and answers the frame that is next then."""
         self._protocol.request_slot()
-        async with self._service.pool.admit(latest=self._protocol.mode == "latest"):
+        latest = self._protocol.mode == "latest"
+        async with AsyncExitStack() as admission:
+            slot = await admission.enter_async_context(self._service.pool.admit(self._caller.quota, latest=latest))
             frame = self._protocol.take_frame()
             assert frame is not None  # noqa: S101 - a waiting frame is replaced, never removed
-            return await self._answer_frame(frame)
+            return await self._answer_frame(frame, slot, admission)
 
-    async def _answer_frame(self, frame: IncomingFrame) -> ServerMessage:
+    async def _answer_frame(self, frame: IncomingFrame, slot: Slot, admission: AsyncExitStack) -> ServerMessage:
         session = self._ensure_session()
         try:
             if frame.refusal is not None:
                 raise frame.refusal
-            self._work = asyncio.create_task(self._process(session, frame))
+            self._work = asyncio.create_task(self._process(session, frame, slot, admission.pop_all()))
             # A frame is processed to its end even if the stream ends, so that the session's state stays consistent.
             processed = await asyncio.shield(self._work)
         except Exception as error:
@@ -233,6 +261,7 @@ class StreamConnection:
                 _log.exception("frame failed", extra=self._log_fields(frame.seq))
             self._service.metrics.frame_failed(error)
             self._complete(session, FrameOutcome.EXPIRED if isinstance(error, ExpiredError) else FrameOutcome.FAILED)
+            self._check_worker_losses(error)
             return error_message(error, seq=frame.seq)
         self._complete(session, FrameOutcome.ANSWERED)
         timing = processed.result.timing_ms
@@ -245,18 +274,33 @@ class StreamConnection:
             camera=self._protocol.options.camera,
         )
 
-    async def _process(self, session: OpenSession, frame: IncomingFrame) -> ProcessedFrame:
+    def _check_worker_losses(self, error: Exception) -> None:
+        """Raises the error, which ends the stream for good, if the stream's frames have cost several workers."""
+        if isinstance(error, WorkerLostError):
+            answered = self._protocol.answered
+            # Frames that were in process beside the one that ended the worker are not held against their stream for long.
+            self._worker_losses = 1 if answered - self._answered_at_loss > _FORGIVEN_AFTER else self._worker_losses + 1
+            self._answered_at_loss = answered
+            if self._worker_losses >= _MOST_WORKER_LOSSES:
+                raise error
+
+    async def _process(
+        self, session: OpenSession, frame: IncomingFrame, slot: Slot, admission: AsyncExitStack
+    ) -> ProcessedFrame:
+        """Returns the lanes of a frame, and holds its admission until then, even if the stream ends before."""
         session.processing = True
-        try:
-            encoded = EncodedFrame(frame.data, frame.timestamp, frame.arrived, frame.deadline)
-            processed = await self._service.pool.run(session.handle, encoded)
-            session.last_seq, session.stream_s = frame.seq, self._protocol.stream_s(time.monotonic())
-            return processed
-        finally:
-            session.processing = False
+        async with admission:
+            try:
+                encoded = EncodedFrame(frame.data, frame.timestamp, frame.arrived, frame.deadline)
+                processed = await self._service.pool.run(session.handle, encoded, slot)
+                session.last_seq, session.stream_s = frame.seq, self._protocol.stream_s(time.monotonic())
+                return processed
+            finally:
+                session.processing = False
 
     def _complete(self, session: OpenSession, outcome: FrameOutcome) -> None:
         self._protocol.complete_frame(outcome, time.monotonic())
+        self._charge.set(self._protocol.held_bytes)
         self._service.sessions.schedule_save(session)
 
     async def _watch(self) -> None:
@@ -297,7 +341,8 @@ class StreamConnection:
             return
         if self._work is not None:
             await asyncio.wait([self._work])
-        await self._service.sessions.close(session, resumable=not self._protocol.ended_by_client)
+        resumable = not self._protocol.ended_by_client and self._worker_losses < _MOST_WORKER_LOSSES
+        await self._service.sessions.close(session, resumable=resumable)
         self._service.metrics.session_closed()
         count = self._protocol.summary(time.monotonic())
         for _ in range(count.frames - count.answered - count.failed - count.dropped):
@@ -328,15 +373,21 @@ class StreamConnection:
             self._service.metrics.socket_closed(code)
 
     async def _end_with(self, error: Exception) -> None:
-        """Sends the error that ends the stream, and closes the socket once the session is ready to be resumed."""
+        """Sends the error that ends the stream, and closes the socket once the session is ready to be resumed.
+
+        Neither waits for the other: a peer that does not read must not keep the session.
+        """
         message = error_message(error, fatal=True)
         reason = message.message.encode()[:_MAX_REASON_BYTES].decode(errors="ignore")
+        releasing = asyncio.create_task(self._release_session())
         try:
             await self._send(message)
-            await self._release_session()
+            await releasing
             await self._close(wire_status(error).close_code, reason)
         except (WebSocketDisconnect, RuntimeError):
             _log.debug("the client disconnected before this error was sent: %s", message.message)
+        finally:
+            await releasing
 
     def _log_fields(self, seq: int | None = None) -> dict[str, str | int | None]:
         """Returns the fields that log records of this stream carry besides their message."""

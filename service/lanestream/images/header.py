@@ -24,8 +24,11 @@ _JPEG_START_OF_SCAN: Final = 0xDA
 _JPEG_END: Final = 0xD9
 # TEM, a marker without a length: decoders read on right after it.
 _JPEG_TEMPORARY: Final = 0x01
-# Every scan of a progressive JPEG is a pass over all pixels, and an empty scan takes only a few bytes.
+# Every scan of a progressive JPEG is a pass over all pixels, and an empty scan takes only a few bytes. Ordinary files
+# have ten scans. More are accepted for images with so few pixels that the passes take a fraction of a second.
+_ORDINARY_JPEG_SCANS: Final = 10
 _MAX_JPEG_SCANS: Final = 100
+_MAX_JPEG_PASSES: Final = 100_000_000
 _MAX_JPEG_SEGMENTS: Final = 2000
 
 _PNG_FIRST_CHUNK: Final = 8
@@ -37,9 +40,9 @@ _PNG_OPTIONAL: Final = 0x20
 _PNG_CHANNELS: Final = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 # Deflate expands one byte to at most this many. A decoder inflates all data, even those beyond the last pixel.
 _DEFLATE_RATIO: Final = 1032
-# Bytes beyond the pixels that a decoder may inflate. They take less than a second. A stricter check would cost as much
-# for every ordinary PNG as decoding it.
-_MAX_EXCESS_BYTES: Final = 1 << 30
+# Bytes beyond the pixels that a decoder may inflate. They take less than a fifth of a second. Files too small to hold as
+# many are not checked, since the check takes as long as decoding.
+_MAX_EXCESS_BYTES: Final = 1 << 26
 _INFLATE_STEP: Final = 1 << 18
 
 _BINARY: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
@@ -114,16 +117,18 @@ def _number(data: bytes, start: int, size: int, *, big: bool = False) -> int:
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
     """Reads the size from the first frame segment; decoders refuse a second one."""
-    at = _find_jpeg_marker(data, _JPEG_SIZE_MARKERS)
+    at = _find_jpeg_marker(data, _JPEG_SIZE_MARKERS, _MAX_JPEG_SCANS)
     return _number(data, at + 5, 2, big=True), _number(data, at + 3, 2, big=True)
 
 
 def _jpeg_body(data: bytes) -> bytes:
     """Returns the file up to its end marker: many cameras pad their files, some append a preview."""
-    return data[: _find_jpeg_marker(data, frozenset({_JPEG_END}))]
+    width, height = _jpeg_size(data)
+    most_scans = min(_MAX_JPEG_SCANS, max(_ORDINARY_JPEG_SCANS, _MAX_JPEG_PASSES // max(1, width * height)))
+    return data[: _find_jpeg_marker(data, frozenset({_JPEG_END}), most_scans)]
 
 
-def _find_jpeg_marker(data: bytes, wanted: frozenset[int]) -> int:
+def _find_jpeg_marker(data: bytes, wanted: frozenset[int], most_scans: int) -> int:
     """Returns the offset after the first of the `wanted` markers, reading marker by marker as a decoder does.
 
     Raises IndexError if there is none, and ImageError if a decoder would stop before it or would take too long.
@@ -139,8 +144,8 @@ def _find_jpeg_marker(data: bytes, wanted: frozenset[int]) -> int:
         if marker == _JPEG_END or _JPEG_TEMPORARY < marker < _JPEG_FIRST:
             raise corrupt_image("JPEG")
         scans += marker == _JPEG_START_OF_SCAN
-        if scans > _MAX_JPEG_SCANS:
-            raise ImageError(f"the JPEG image has more than {_MAX_JPEG_SCANS} scans", "save it as a baseline JPEG")
+        if scans > most_scans:
+            raise ImageError(f"the JPEG image has more than {most_scans} scans", "save it as a baseline JPEG")
         if marker != _JPEG_TEMPORARY:
             at += _number(data, at, 2, big=True)
     raise ImageError(f"the JPEG image has more than {_MAX_JPEG_SEGMENTS:,} segments", "save it as a baseline JPEG")

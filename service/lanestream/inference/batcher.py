@@ -12,14 +12,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.errors import ExpiredError, LanestreamError
+from lanestream.errors import ExpiredError
 
 _log = logging.getLogger(__name__)
 
@@ -183,8 +184,8 @@ class Batcher:
 
     def _take(self) -> _Batch:
         """Returns the next batch, which the caller has to run."""
-        self._running = True
         requests, expired = self._queue.take(time.monotonic())
+        self._running = True
         return _Batch(requests, expired, len(self._queue))
 
     def _run(self, batch: _Batch) -> None:
@@ -195,6 +196,11 @@ class Batcher:
             wanted = [request for request in batch.requests if request.future.set_running_or_notify_cancel()]
             if wanted:
                 self._run_requests(wanted, batch.still_waiting)
+        except BaseException as error:
+            # Whatever failed, callers must not wait forever, and later batches have to run.
+            _log.exception("a batch of %d requests failed", len(batch.requests))
+            for request in (*batch.expired, *batch.requests):
+                _fail(request, error)
         finally:
             with self._changed:
                 self._running = False
@@ -207,6 +213,7 @@ class Batcher:
         inputs = [request.inputs for request in requests]
         try:
             outputs = model.run(inputs[0] if len(inputs) == 1 else np.concatenate(inputs))
+            parts = np.split(outputs, np.cumsum([len(part) for part in inputs])[:-1])
         except Exception as error:
             if len(requests) == 1:
                 requests[0].future.set_exception(error)
@@ -216,7 +223,6 @@ class Batcher:
                     self._run_requests([request], still_waiting)
             return
         ended = time.monotonic()
-        parts = np.split(outputs, np.cumsum([len(part) for part in inputs])[:-1])
         for request, part in zip(requests, parts, strict=True):
             request.future.set_result(InferenceResult(part, started, ended))
         if self._observe is not None:
@@ -224,6 +230,7 @@ class Batcher:
             self._observe(BatchReport(model.name, len(outputs), len(requests), still_waiting, longest_wait))
 
 
-def _fail(request: InferenceRequest, error: LanestreamError) -> None:
-    if request.future.set_running_or_notify_cancel():
+def _fail(request: InferenceRequest, error: BaseException) -> None:
+    """Answers a request with an error, unless it was answered or canceled before."""
+    with suppress(InvalidStateError):
         request.future.set_exception(error)

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.errors import ModelError, one_line
 from lanestream.inference.model_info import ModelInfo
+
+# Where in their own source code the runtimes found a problem: onnxruntime, then OpenVINO.
+_CODE_PLACES: Final = re.compile(
+    r"\[ONNXRuntimeError\] : \d+ : \w+ : |/\S+:\d+ [^()]*\([^()]*\) "
+    r"|Exception from \S+:\d+:\s+|Check '[^']*' failed at \S+:\d+:\s+"
+)
 
 
 @dataclass(frozen=True)
@@ -60,12 +68,18 @@ class LoadedModel(ABC):
         return self.info.model_dump()
 
     def warm_up(self) -> None:
-        """Runs every batch size once, so that the first frame does not wait."""
+        """Runs every batch size once, so that the first frame does not wait. Raises ModelError if a run fails."""
         # The largest first, then the smallest: memory is allocated once, and an engine that is built for a range of
         # sizes is built for all of them.
         *smaller, largest = self.placement.batch_sizes
-        for batch in (largest, *smaller):
-            self.run(self.blank(batch))
+        try:
+            for batch in (largest, *smaller):
+                self.run(self.blank(batch))
+        except Exception as error:  # also of onnxruntime and OpenVINO, which have types of their own
+            raise ModelError(
+                f"the model {self.name} fails when it runs on {self.placement.provider}: {runtime_message(error)}",
+                "give a file exported by `lanestream export`, and enough memory",
+            ) from error
 
     def blank(self, batch: int) -> NDArray[np.uint8]:
         """Returns black inputs (batch, size, size, 3)."""
@@ -93,3 +107,8 @@ class LoadedModel(ABC):
     @abstractmethod
     def _outputs(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Returns outputs (N, outputs) that the caller may keep, for contiguous inputs; N is one of the batch sizes."""
+
+
+def runtime_message(error: Exception) -> str:
+    """Returns the message of an error of a runtime on one line, without places in the runtime's source code."""
+    return one_line(_CODE_PLACES.sub("", str(error))) or type(error).__name__

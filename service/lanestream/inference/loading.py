@@ -6,8 +6,8 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-from lanestream.errors import ProviderError
-from lanestream.inference.loaded_model import LoadedModel
+from lanestream.errors import ModelError, ProviderError
+from lanestream.inference.loaded_model import LoadedModel, runtime_message
 from lanestream.inference.providers import AUTO, CPU, DEFAULT_OPTIONS, Installed, RuntimeOptions, attempts
 
 
@@ -33,6 +33,12 @@ def load_model(
                 raise
             failed.append(error.message)
             fell_back |= is_installed
+        except ModelError:
+            raise
+        except Exception as error:  # nothing that is wrong with a file may look like a fault of this program
+            raise ModelError(
+                f"{path} can't be loaded: {runtime_message(error)}", "give a file exported by `lanestream export`"
+            ) from error
         else:
             model.placement = replace(model.placement, fell_back=fell_back)
             with path.open("rb") as file:

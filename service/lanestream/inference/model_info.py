@@ -82,9 +82,14 @@ _ADAPTER: Final[TypeAdapter[ModelInfo]] = TypeAdapter(Annotated[ModelInfo, Field
 
 
 def require_file(path: Path) -> None:
-    """Raises ModelError if there is no file at `path`."""
-    if not path.is_file():
-        raise ModelError(f"no model file at {path}", "give the path of an exported .onnx file")
+    """Raises ModelError if there is no file at `path`, or if it can't be read."""
+    hint = "give the path of an exported .onnx file"
+    try:
+        if not path.is_file():
+            raise ModelError(f"no model file at {path}", hint)
+        path.open("rb").close()
+    except OSError as error:
+        raise ModelError(f"can't read {path}: {(error.strerror or str(error)).lower()}", hint) from None
 
 
 def parse_info(metadata: dict[str, str], source: str) -> ModelInfo:

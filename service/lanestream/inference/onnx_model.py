@@ -13,9 +13,9 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from lanestream.errors import ModelError, ProviderError, one_line
+from lanestream.errors import ModelError, ProviderError
 from lanestream.host import processors
-from lanestream.inference.loaded_model import LoadedModel, Placement
+from lanestream.inference.loaded_model import LoadedModel, Placement, runtime_message
 from lanestream.inference.model_info import ModelInfo, parse_info, require_file
 from lanestream.inference.providers import CPU, CUDA, DEFAULT_OPTIONS, ProviderSpec, RuntimeOptions
 
@@ -106,7 +106,7 @@ def _cpu_session(path: Path, threads: int | None) -> Any:
         )
     except Exception as error:  # onnxruntime raises a type per status, all of them private
         raise ModelError(
-            f"{path} is not a model that can run: {one_line(error)}", "give an exported .onnx file"
+            f"{path} is not a model that can run: {runtime_message(error)}", "give an exported .onnx file"
         ) from error
 
 
@@ -122,7 +122,7 @@ def _gpu_session(path: Path, spec: ProviderSpec, options: RuntimeOptions) -> Any
         )
     except Exception as error:
         raise ProviderError(
-            f"{spec.name} does not work: {one_line(error)}",
+            f"{spec.name} does not work: {runtime_message(error)}",
             "check the driver and the libraries with `lanestream doctor`, or use the provider auto or cpu",
         ) from error
 
@@ -130,7 +130,8 @@ def _gpu_session(path: Path, spec: ProviderSpec, options: RuntimeOptions) -> Any
 def _session_options(threads: int | None) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or processors()
-    options.log_severity_level = 3
+    # Only fatal errors: it raises all others, too, and they are reported once.
+    options.log_severity_level = 4
     # Threads that spin while they wait take processor time from those that decode and search the next frame.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")

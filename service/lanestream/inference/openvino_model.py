@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lanestream.errors import ModelError, ProviderError, one_line
 from lanestream.host import processors
-from lanestream.inference.loaded_model import LoadedModel, Placement
+from lanestream.inference.loaded_model import LoadedModel, Placement, runtime_message
 from lanestream.inference.model_info import METADATA_KEY, ModelInfo, parse_info, require_file
 from lanestream.inference.providers import DEFAULT_OPTIONS, OPENVINO, ProviderSpec, RuntimeOptions
 
@@ -43,13 +43,15 @@ def load(
         read = reader.load(str(path))
     except Exception as error:  # OpenVINO raises a type per failure, all of them private
         raise ModelError(
-            f"{path} is not a model that can run: {one_line(error)}", "give an exported .onnx file"
+            f"{path} is not a model that can run: {runtime_message(error)}", "give an exported .onnx file"
         ) from error
     try:
         model = reader.convert(read)
         compiled = openvino.Core().compile_model(model, "CPU", _properties(options.threads))
     except Exception as error:
-        raise ProviderError(f"OpenVINO can't run {path}: {one_line(error)}", "use the provider auto or cpu") from error
+        raise ProviderError(
+            f"OpenVINO can't run {path}: {runtime_message(error)}", "use the provider auto or cpu"
+        ) from error
     threads = compiled.get_property("INFERENCE_NUM_THREADS")
     placement = Placement(spec.name, reason, threads, _nodes(compiled), _BATCH_SIZES)
     return OpenVinoModel(compiled, _info(model, path), placement)

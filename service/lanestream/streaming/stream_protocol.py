@@ -21,6 +21,7 @@ from lanestream.protocol import (
     SummaryMessage,
     error_message,
 )
+from lanestream.streaming.token_bucket import TokenBucket
 
 
 @dataclass(frozen=True)
@@ -86,26 +87,6 @@ class FrameOutcome(Enum):
     EXPIRED = auto()
 
 
-class TokenBucket:
-    """Limits a rate: `rate` units per second on average, with bursts of `burst_s` seconds' worth."""
-
-    def __init__(self, rate: float, burst_s: float, now: float) -> None:
-        self._rate = rate
-        self._capacity = max(rate * burst_s, 1.0)
-        self._tokens = self._capacity
-        self._updated_at = now
-
-    def covers(self, amount: float, now: float) -> bool:
-        """Returns whether `amount` is available. An amount above the capacity needs a full bucket."""
-        self._tokens = min(self._capacity, self._tokens + self._rate * (now - self._updated_at))
-        self._updated_at = now
-        return self._tokens >= min(amount, self._capacity)
-
-    def spend(self, amount: float) -> None:
-        """Removes `amount`; the level may become negative."""
-        self._tokens -= amount
-
-
 class StreamProtocol:
     """The server side of one stream, from its first message to its last.
 
@@ -146,6 +127,11 @@ class StreamProtocol:
         return self._options.mode
 
     @property
+    def answered(self) -> int:
+        """Frames that were answered with lanes."""
+        return self._answered
+
+    @property
     def dropped(self) -> int:
         """Frames without an answer, because a newer one replaced them or because they expired."""
         return self._dropped
@@ -154,6 +140,12 @@ class StreamProtocol:
     def has_waiting_frame(self) -> bool:
         """Whether `take_frame` would return a frame."""
         return bool(self._waiting) and self._current is None
+
+    @property
+    def held_bytes(self) -> int:
+        """The bytes of the images that are not answered yet."""
+        current = 0 if self._current is None else len(self._current.data)
+        return current + sum(len(frame.data) for frame in self._waiting)
 
     @property
     def ended_by_client(self) -> bool:
@@ -199,9 +191,10 @@ class StreamProtocol:
             case EndMessage():
                 self._state = StreamState.ENDING
 
-    def receive_image(self, data: bytes, now: float) -> int:
+    def receive_image(self, data: bytes, now: float, refusal: LanestreamError | None = None) -> int:
         """Accepts or refuses a frame and returns how many waiting frames it replaced. A first image opens the stream.
 
+        `refusal` is an error by which it is refused in any case.
         Raises OverrunError in mode `all` if no credit is left, and ProtocolError after `end`.
         """
         self._note_activity("an image", now)
@@ -215,7 +208,7 @@ class StreamProtocol:
                 f"another frame came while {unanswered} frames were unanswered",
                 f"mode `all` allows {self._limits.credits} unanswered frames; wait for answers, or use mode `latest`",
             )
-        refusal = self._refusal(len(data), now)
+        refusal = refusal or self._refusal(len(data), now)
         replaced = self._replace_waiting(refused=refusal is not None) if self.mode == "latest" else 0
         self._waiting.append(self._numbered(data, now, refusal))
         self._received += 1

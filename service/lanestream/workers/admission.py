@@ -1,64 +1,151 @@
-"""Admission: which frame is processed next if there are more frames than slots."""
+"""Admission: which frame is processed next if there are more frames than slots.
+
+Callers share the processors, not the queue: of the callers with waiting frames, the one that has used the least
+processor time goes first, so that neither many sessions nor costly images take more than a share. The method is
+start-time fair queueing (Goyal, Vin and Cheng, SIGCOMM 1996), with costs that are known only afterwards.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from typing import Final
+
+# A caller counts as active for this long after its last frame.
+_ACTIVE_S: Final = 1.0
+# The weight of a frame's cost in the mean by which the next one is estimated, and the estimate for a new caller.
+_GAIN: Final = 0.25
+_FIRST_COST_S: Final = 0.02
+
+
+@dataclass(eq=False)
+class Slot:
+    """A frame's permission to be processed, and what it has cost so far in seconds of processor time."""
+
+    cost_s: float = 0.0
+
+    def charge(self, seconds: float) -> None:
+        """Adds processor time to the caller's account."""
+        self.cost_s += seconds
 
 
 @dataclass(eq=False)
 class _Waiter:
     latest: bool
+    estimate_s: float = 0.0
     admitted: asyncio.Future[None] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
 
 
-class FairSemaphore:
-    """Admits frames to `slots`, first come, first served; at most `latest_slots` of them for frames of mode `latest`.
+@dataclass(eq=False)
+class _Account:
+    """A caller's waiting frames, the slots it holds, and its processor time on the clock that all callers share."""
 
-    A frame of mode `latest` that may not take a free slot keeps its position in the queue, so cameras of neither mode
-    can starve the others. Belongs to one event loop.
+    used_s: float
+    active_at: float
+    mean_cost_s: float = _FIRST_COST_S
+    held: int = 0
+    queue: deque[_Waiter] = field(default_factory=deque)
+
+
+class FairSemaphore:
+    """Admits frames to `slots`; at most `latest_slots` of them for frames of mode `latest`.
+
+    While several callers are active, each may hold `per_caller` slots: a frame is never interrupted, so costly ones
+    must not occupy every processor. The frames of one caller are admitted in their order, except that one of mode
+    `latest` that may not take a free slot keeps its position. `clock` returns monotonic seconds. Belongs to one event
+    loop.
     """
 
-    def __init__(self, slots: int, latest_slots: int) -> None:
-        self._slots, self._latest_slots = slots, latest_slots
-        self._queue: deque[_Waiter] = deque()
+    def __init__(
+        self, slots: int, latest_slots: int, per_caller: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._slots, self._latest_slots, self._per_caller = slots, latest_slots, per_caller
+        self._clock = clock
+        self._accounts: dict[str, _Account] = {}
+        # The time used by the caller that was admitted last. A caller that was idle begins here: it has no arrears,
+        # and what it used while no one else wanted it is not held against it.
+        self._virtual_s = 0.0
 
     @asynccontextmanager
-    async def slot(self, *, latest: bool = False) -> AsyncIterator[None]:
+    async def slot(self, caller: str, *, latest: bool = False) -> AsyncIterator[Slot]:
         """Waits for a slot and holds it for the block."""
-        waiter = _Waiter(latest)
-        self._queue.append(waiter)
+        account = self._accounts.setdefault(caller, _Account(self._virtual_s, self._clock()))
+        if not account.queue and not account.held:
+            account.used_s = max(account.used_s, self._virtual_s)
+        account.active_at = self._clock()
+        waiter, slot = _Waiter(latest), Slot()
+        account.queue.append(waiter)
         self._admit()
         try:
             await waiter.admitted
         except asyncio.CancelledError:
-            if waiter in self._queue:
-                self._queue.remove(waiter)
+            if waiter in account.queue:
+                account.queue.remove(waiter)
             else:  # admitted at the moment it was canceled
-                self._release(waiter)
+                self._release(account, waiter, slot)
             raise
         try:
-            yield
+            yield slot
         finally:
-            self._release(waiter)
+            self._release(account, waiter, slot)
 
     def _admit(self) -> None:
-        """Gives the free slots to the frames that have waited longest, within the limit for mode `latest`."""
-        for waiter in tuple(self._queue):
-            if not self._slots:
+        """Gives the free slots away, each to the caller that has used the least time of those that may take it."""
+        while self._slots:
+            waiting = sorted((each for each in self._accounts.values() if each.queue), key=lambda each: each.used_s)
+            if not any(self._take_slot(account) for account in waiting):
                 return
-            if waiter.latest and not self._latest_slots:
-                continue
-            self._queue.remove(waiter)
-            self._slots -= 1
-            self._latest_slots -= waiter.latest
-            if not waiter.admitted.done():
-                waiter.admitted.set_result(None)
 
-    def _release(self, waiter: _Waiter) -> None:
+    def _take_slot(self, account: _Account) -> bool:
+        """Gives a slot to the first frame of a caller that may take one. Returns False if none may."""
+        if account.held >= self._per_caller and not self._is_alone(account):
+            return False
+        waiter = next((each for each in account.queue if self._latest_slots or not each.latest), None)
+        if waiter is None:
+            return False
+        account.queue.remove(waiter)
+        self._slots -= 1
+        self._latest_slots -= waiter.latest
+        self._virtual_s = max(self._virtual_s, account.used_s)
+        # Charged now, so that several free slots do not all go to one caller; corrected when the cost is known.
+        waiter.estimate_s = account.mean_cost_s
+        account.used_s += waiter.estimate_s
+        account.held += 1
+        if not waiter.admitted.done():
+            waiter.admitted.set_result(None)
+        return True
+
+    def _is_alone(self, account: _Account) -> bool:
+        """Returns whether no other caller is active."""
+        since = self._clock() - _ACTIVE_S
+        return not any(
+            other is not account and (other.queue or other.held or other.active_at > since)
+            for other in self._accounts.values()
+        )
+
+    def _release(self, account: _Account, waiter: _Waiter, slot: Slot) -> None:
         self._slots += 1
         self._latest_slots += waiter.latest
+        account.held -= 1
+        account.used_s += slot.cost_s - waiter.estimate_s
+        account.mean_cost_s += _GAIN * (slot.cost_s - account.mean_cost_s)
+        account.active_at = self._clock()
+        self._settle()
         self._admit()
+
+    def _settle(self) -> None:
+        """Ends all arrears if no frame is left, and deletes the accounts of idle callers that have none."""
+        if not any(each.queue or each.held for each in self._accounts.values()):
+            self._virtual_s = max(each.used_s for each in self._accounts.values())
+        since = self._clock() - _ACTIVE_S
+        idle = [
+            caller
+            for caller, each in self._accounts.items()
+            if not each.queue and not each.held and each.active_at <= since and each.used_s <= self._virtual_s
+        ]
+        for caller in idle:
+            del self._accounts[caller]

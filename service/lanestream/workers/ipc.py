@@ -41,7 +41,6 @@ class WorkerSetup:
 class FrameJob:
     """A frame and the session it belongs to; `horizon` and `detector` are those of `WorkerPool.open_session`."""
 
-    number: int
     frame: EncodedFrame
     state: SessionState
     horizon: float | None
@@ -50,10 +49,15 @@ class FrameJob:
 
 @dataclass(frozen=True)
 class FrameDone:
-    """The outcome of a job: lanes and the session's new state, or an error; and reports of recent batches."""
+    """The outcome of a job: lanes and the session's new state, or an error; and reports of recent batches.
+
+    `number` says which of the worker's jobs it was, from 0 in the order in which they were sent. `cpu_s` is the
+    processor time that it took (seconds).
+    """
 
     number: int
     outcome: FrameOutcome
+    cpu_s: float
     batches: tuple[BatchReport, ...] = ()
 
 
@@ -66,13 +70,23 @@ def encode_message(value: object) -> bytes:
 async def read_message(reader: asyncio.StreamReader) -> Any:
     """Returns the next message. Raises EOFError at the end, and ConnectionError if the other process is gone."""
     (length,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
-    return pickle.loads(await reader.readexactly(length))  # noqa: S301 - from our own process
+    return decode_message(await reader.readexactly(length))
 
 
 def receive_message(channel: socket.socket) -> Any:
     """Returns the next message, blocking. Raises EOFError at the end."""
+    return decode_message(receive_bytes(channel))
+
+
+def receive_bytes(channel: socket.socket) -> bytearray:
+    """Returns the next message before it is decoded, blocking. Raises EOFError at the end."""
     (length,) = _LENGTH.unpack(_receive_exactly(channel, _LENGTH.size))
-    return pickle.loads(_receive_exactly(channel, length))  # noqa: S301 - from our own process
+    return _receive_exactly(channel, length)
+
+
+def decode_message(body: bytes | bytearray) -> Any:
+    """Returns the object in a message."""
+    return pickle.loads(body)  # noqa: S301 - from our own process
 
 
 def _receive_exactly(channel: socket.socket, length: int) -> bytearray:

@@ -7,15 +7,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager
-from typing import TYPE_CHECKING, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Literal, ParamSpec, Protocol, TypeVar
 
-from lanestream.workers.admission import FairSemaphore
+from lanestream.workers.admission import FairSemaphore, Slot
 
 if TYPE_CHECKING:
     from lanestream.messages import ProcessedFrame
     from lanestream.session import SessionState
     from lanestream.workers.capabilities import Capabilities
     from lanestream.workers.frame_worker import EncodedFrame
+
+WorkerEvent = Literal["ended", "hung", "start_failed", "replaced"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -44,7 +46,12 @@ class WorkerPool(ABC):
         # Each process gets one frame more than it has threads, so that a thread that becomes free continues without
         # waiting for the event loop. Frames of mode `latest` leave two of many threads idle: for them, latency matters
         # more than the last bit of throughput.
-        self._admission = FairSemaphore(workers * (threads_each + 1), workers * max(1, threads_each - 2))
+        parallel = workers * threads_each
+        self._admission = FairSemaphore(
+            slots=parallel + workers,
+            latest_slots=workers * max(1, threads_each - 2),
+            per_caller=(parallel + 1) // 2,
+        )
         self._threads = ThreadPoolExecutor(own_threads, thread_name_prefix="lanestream-frames")
 
     @property
@@ -53,13 +60,18 @@ class WorkerPool(ABC):
         return True
 
     @property
+    def upkeep_failed(self) -> bool:
+        """Whether workers that end are no longer replaced."""
+        return False
+
+    @property
     def pids(self) -> tuple[int, ...]:
         """The process ids of the workers; empty if they are threads of this process."""
         return ()
 
-    def admit(self, *, latest: bool = False) -> AbstractAsyncContextManager[None]:
-        """Returns a context that waits for a slot, first come, first served, and holds it. `run` requires it."""
-        return self._admission.slot(latest=latest)
+    def admit(self, caller: str, *, latest: bool = False) -> AbstractAsyncContextManager[Slot]:
+        """Returns a context that waits for a slot and holds it; callers get equal shares of the processors."""
+        return self._admission.slot(caller, latest=latest)
 
     @abstractmethod
     def open_session(self, horizon: float | None = None, detector: str | None = None) -> SessionHandle:
@@ -69,11 +81,12 @@ class WorkerPool(ABC):
         """
 
     @abstractmethod
-    async def run(self, session: SessionHandle, frame: EncodedFrame) -> ProcessedFrame:
-        """Returns the lanes of `frame`; `session` is from `open_session`.
+    async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:
+        """Returns the lanes of `frame`; `session` is from `open_session`. Charges `slot` with the processor time.
 
         Raises ImageError if the file is refused, ExpiredError if its deadline passes before the networks run,
-        WorkerLostError if the worker process ends. In these cases the session stays as it was.
+        WorkerLostError if the frame may be why its worker process ended or hung, and NotReadyError if no worker is
+        alive. In these cases the session stays as it was.
         """
 
     async def in_thread(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

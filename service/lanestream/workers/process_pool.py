@@ -4,44 +4,58 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import socket
-import sys
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import replace
-from itertools import count
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from lanestream.errors import LanestreamError, WorkerLostError
+from lanestream.errors import LanestreamError, NotReadyError, WorkerLostError
 from lanestream.host import memory_limit, processors
 from lanestream.inference.providers import PROVIDERS
 from lanestream.session import SessionState
 from lanestream.tracking.tracker import LaneTracker
-from lanestream.workers.capabilities import Capabilities
-from lanestream.workers.ipc import FrameDone, FrameJob, WorkerSetup, encode_message, read_message
-from lanestream.workers.pool import SessionHandle, WorkerPool
+from lanestream.workers.ipc import FrameDone, FrameJob, WorkerSetup
+from lanestream.workers.pool import SessionHandle, WorkerEvent, WorkerPool
+from lanestream.workers.worker import Worker
 
 if TYPE_CHECKING:
     from lanestream.inference.batcher import BatchReport
     from lanestream.messages import ProcessedFrame
+    from lanestream.workers.admission import Slot
+    from lanestream.workers.capabilities import Capabilities
     from lanestream.workers.frame_worker import EncodedFrame
 
 _log = logging.getLogger(__name__)
 
-_PROGRAM: Final = "lanestream.workers.worker_main"
 # Each process has its own networks, so more processes are started only on request.
 _MOST_PROCESSES: Final = 8
 # The memory that a worker and the service itself may need for frames of any accepted size.
 _WORKER_BYTES: Final = 400e6
 _SERVICE_BYTES: Final = 300e6
-# The pause before another worker starts in place of one that ended, doubled after each failure.
-_RESTART_S: Final = 0.5
-_LONGEST_RESTART_S: Final = 30.0
-_END_S: Final = 10.0
-# A frame takes a fraction of a second, or many seconds on a busy machine; a worker that takes longer than this hangs.
-_FRAME_S: Final = 30.0
-# The time limit is waited for in parts: after the service was suspended, only one part has passed, not all.
-_PARTS: Final = 10
+# A frame takes a fraction of a second. A worker that takes longer than this hangs.
+_FRAME_S: Final = 5.0
+# Loading takes seconds, but TensorRT may build engines for minutes.
+_START_S: Final = 300.0
+
+
+@dataclass(frozen=True)
+class RestartPolicy:
+    """The pauses before a worker is replaced (seconds): `first_s`, doubled up to `longest_s` while starts don't help.
+
+    A start has helped if the worker lives for `good_uptime_s` seconds.
+    """
+
+    first_s: float = 0.5
+    longest_s: float = 30.0
+    good_uptime_s: float = 60.0
+
+    def next_pause(self, last_s: float, uptime_s: float) -> float:
+        """Returns the pause after a worker that lived for `uptime_s`; `last_s` is the pause before it, 0 if none."""
+        if uptime_s >= self.good_uptime_s:
+            return self.first_s
+        return min(max(2.0 * last_s, self.first_s), self.longest_s)
+
+
+_RESTARTS: Final = RestartPolicy()
 
 
 class RemoteSession:
@@ -57,135 +71,12 @@ class RemoteSession:
         self.state = replace(state, tracker=LaneTracker.restored(state.tracker, ids_lost).state)
 
 
-class Worker:
-    """A worker process, as the service sees it."""
-
-    def __init__(
-        self, process: asyncio.subprocess.Process, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
-        self._process, self._reader, self._writer = process, reader, writer
-        self._jobs: dict[int, asyncio.Future[FrameDone]] = {}
-        self._numbers = count()
-        self._listening: asyncio.Task[None] | None = None
-        self.capabilities = Capabilities(())
-
-    @classmethod
-    async def start(cls, setup: WorkerSetup) -> Worker:
-        """Returns a worker with a warm engine.
-
-        Raises the errors of `setup.load`, and WorkerLostError if the process ends before it is ready.
-        """
-        mine, theirs = socket.socketpair()
-        with theirs:
-            # -P: modules are never imported from the folder that the service was started in.
-            arguments = (sys.executable, "-P", "-m", _PROGRAM, str(theirs.fileno()))
-            process = await asyncio.create_subprocess_exec(
-                *arguments, stdin=asyncio.subprocess.DEVNULL, pass_fds=[theirs.fileno()]
-            )
-        worker = cls(process, *await asyncio.open_unix_connection(sock=mine))
-        try:
-            worker._writer.write(encode_message(setup))
-            worker.capabilities = await worker._receive_capabilities()
-        except BaseException:
-            await worker.kill()
-            raise
-        return worker
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether it can take frames."""
-        return self._listening is not None and not self._listening.done()
-
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-        return self._process.pid
-
-    @property
-    def pending(self) -> int:
-        """The number of its unfinished frames."""
-        return len(self._jobs)
-
-    def begin(self, threads: int) -> None:
-        """Starts processing frames, in this number of threads."""
-        self._writer.write(encode_message(threads))
-        self._listening = asyncio.create_task(self._listen())
-
-    async def process(self, session: RemoteSession, frame: EncodedFrame, limit_s: float) -> FrameDone:
-        """Returns the outcome of a frame.
-
-        Raises WorkerLostError if the worker ends first, TimeoutError if the frame takes `limit_s` seconds. Time during
-        which the service was suspended, for example with its container, hardly counts: so was the worker.
-        """
-        number = next(self._numbers)
-        done: asyncio.Future[FrameDone] = asyncio.get_running_loop().create_future()
-        self._jobs[number] = done
-        job = FrameJob(number, frame, session.state, session.horizon, session.detector)
-        self._writer.write(encode_message(job))
-        try:
-            for _ in range(_PARTS):
-                await asyncio.wait([done], timeout=limit_s / _PARTS)
-                if done.done():
-                    return done.result()
-            raise TimeoutError
-        finally:
-            del self._jobs[number]
-
-    async def wait_ended(self) -> int:
-        """Waits until the process ends, which loses its frames, and returns the exit status."""
-        assert self._listening is not None  # noqa: S101 - begun by the pool
-        await self._listening
-        self._writer.close()
-        return await self._process.wait()
-
-    async def close(self) -> None:
-        """Ends the process after its current work."""
-        self._writer.close()
-        with suppress(TimeoutError):
-            async with asyncio.timeout(_END_S):
-                await self._process.wait()
-        await self.kill()
-
-    async def kill(self) -> None:
-        """Kills the process."""
-        self._writer.close()
-        with suppress(ProcessLookupError):
-            self._process.kill()
-        await self._process.wait()
-
-    async def _receive_capabilities(self) -> Capabilities:
-        try:
-            capabilities = await read_message(self._reader)
-        except (EOFError, ConnectionError):
-            status = await self._process.wait()
-            raise WorkerLostError(f"a worker process ended with status {status} while it started") from None
-        if isinstance(capabilities, Exception):
-            raise capabilities
-        assert isinstance(capabilities, Capabilities)  # noqa: S101 - the first message of a worker
-        return capabilities
-
-    async def _listen(self) -> None:
-        try:
-            while True:
-                done: FrameDone = await read_message(self._reader)
-                job = self._jobs.get(done.number)
-                if job is not None and not job.done():
-                    job.set_result(done)
-        except (EOFError, ConnectionError):
-            pass
-        except Exception:
-            _log.exception("a worker process sent an unreadable message")
-            await self.kill()
-        for job in self._jobs.values():
-            if not job.done():
-                job.set_exception(_lost())
-
-
 class ProcessPool(WorkerPool):
     """Sends each frame, with the state of its session, to the worker process that has the fewest frames.
 
-    Workers that end are replaced, and one that takes `frame_s` seconds for a frame is killed. `observe`, if given, gets
-    the report of every batch that their networks run.
+    Workers that end are replaced as `restarts` says. One that takes `frame_s` seconds for a frame is killed; so is a
+    new one that is not ready after `start_s` seconds. `observe`, if given, gets the report of every batch that their
+    networks run, and `observe_worker` every event of a worker.
     """
 
     def __init__(
@@ -195,6 +86,9 @@ class ProcessPool(WorkerPool):
         threads: int,
         observe: Callable[[BatchReport], None] | None = None,
         frame_s: float = _FRAME_S,
+        start_s: float = _START_S,
+        restarts: RestartPolicy = _RESTARTS,
+        observe_worker: Callable[[WorkerEvent], None] | None = None,
     ) -> None:
         super().__init__(workers[0].capabilities, len(workers), threads, processors())
         self._setup = setup
@@ -202,9 +96,15 @@ class ProcessPool(WorkerPool):
         self._threads_each = threads
         self._observe = observe
         self._frame_s = frame_s
+        self._start_s = start_s
+        self._restarts = restarts
+        self._observe_worker = observe_worker
+        self._closing = False
         for worker in workers:
-            worker.begin(threads)
+            worker.begin(threads, frame_s)
         self._supervisors = [asyncio.create_task(self._supervise(worker)) for worker in workers]
+        for supervisor in self._supervisors:
+            supervisor.add_done_callback(self._supervisor_ended)
 
     @classmethod
     async def start(
@@ -214,29 +114,38 @@ class ProcessPool(WorkerPool):
         threads_of: Callable[[int], int] | None = None,
         observe: Callable[[BatchReport], None] | None = None,
         frame_s: float = _FRAME_S,
+        start_s: float = _START_S,
+        restarts: RestartPolicy = _RESTARTS,
+        observe_worker: Callable[[WorkerEvent], None] | None = None,
     ) -> ProcessPool:
         """Returns a pool with warm workers. `threads_of(processes)` is the number of threads of each; default 1.
 
         By default networks on the CPU get one process per processor, at most 8 and as many as fit into a container's
         memory. Networks on a GPU get one process, in which the requests of all cameras meet. Raises the errors of
-        `setup.load`.
+        `setup.load`, and WorkerLostError if a worker ends before it is ready or is not ready after `start_s` seconds.
         """
-        workers = [await Worker.start(setup)]
+        workers = [await Worker.start(setup, start_s)]
         try:
             processes = processes or default_processes(workers[0].capabilities)
             async with asyncio.TaskGroup() as starting:
                 for _ in range(processes - 1):
-                    starting.create_task(_add(workers, setup))
+                    starting.create_task(_add(workers, setup, start_s))
         except BaseException as error:
             for worker in workers:
                 await worker.kill()
             raise error.exceptions[0] if isinstance(error, ExceptionGroup) else error from None
-        return cls(setup, workers, threads_of(processes) if threads_of is not None else 1, observe, frame_s)
+        threads = threads_of(processes) if threads_of is not None else 1
+        return cls(setup, workers, threads, observe, frame_s, start_s, restarts, observe_worker)
 
     @property
     def works(self) -> bool:
         """Whether a worker is alive."""
         return bool(self._alive)
+
+    @property
+    def upkeep_failed(self) -> bool:
+        """Whether workers that end are no longer replaced, because of an error in this program."""
+        return not self._closing and any(supervisor.done() for supervisor in self._supervisors)
 
     @property
     def pids(self) -> tuple[int, ...]:
@@ -252,18 +161,14 @@ class ProcessPool(WorkerPool):
         self.capabilities.select(detector)
         return RemoteSession(horizon, detector)
 
-    async def run(self, session: SessionHandle, frame: EncodedFrame) -> ProcessedFrame:
-        """Returns the lanes of `frame`, see `WorkerPool.run`."""
+    async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:
+        """Returns the lanes of `frame`, see `WorkerPool.run`.
+
+        Raises WorkerLostError only if the frame may be why its worker ended: no other worker gets it. A frame that
+        waited in that worker goes to another one; raises NotReadyError if there are none.
+        """
         assert isinstance(session, RemoteSession)  # noqa: S101 - opened here
-        if not self._alive:
-            raise _lost()
-        worker = min(self._alive, key=lambda each: each.pending)
-        try:
-            done = await worker.process(session, frame, self._frame_s)
-        except TimeoutError:
-            _log.error("a worker process took more than %g s for a frame and is killed", self._frame_s)
-            await worker.kill()
-            raise _lost() from None
+        done = await self._process(FrameJob(frame, session.state, session.horizon, session.detector), slot)
         if self._observe is not None:
             for report in done.batches:
                 self._observe(report)
@@ -272,37 +177,79 @@ class ProcessPool(WorkerPool):
         processed, session.state = done.outcome
         return processed
 
+    async def _process(self, job: FrameJob, slot: Slot) -> FrameDone:
+        while alive := self._alive:
+            worker = min(alive, key=lambda each: (each.is_slow, each.pending))
+            outcome = await worker.submit(job)
+            if isinstance(outcome, FrameDone):
+                slot.charge(outcome.cpu_s)
+                return outcome
+            if outcome.ran_s is not None:
+                # The time limit also bounds what a frame is charged that was suspended together with the service.
+                slot.charge(min(outcome.ran_s, self._frame_s))
+                raise WorkerLostError(
+                    "the process that had the frame has ended", "send the next frame; the service continues"
+                )
+        raise NotReadyError("the worker processes are restarting", "send the frame again in a moment")
+
     async def close(self) -> None:
-        """Ends the workers after their current work."""
+        """Ends the workers. The frames that they have are lost."""
+        self._closing = True
         for supervisor in self._supervisors:
             supervisor.cancel()
         await asyncio.wait(self._supervisors)
         await asyncio.gather(*(worker.close() for worker in self._workers))
         await super().close()
 
-    async def _supervise(self, worker: Worker) -> None:
-        """Replaces a worker each time it ends."""
+    async def _supervise(self, first: Worker) -> None:
+        """Replaces a worker each time it ends, and tries again if another one can't be started."""
+        worker: Worker | None = first
+        pause_s = 0.0
         while True:
-            status = await worker.wait_ended()
-            self._workers.remove(worker)
-            _log.error("a worker process ended with status %d and is replaced", status)
-            worker = await self._restart()
-            worker.begin(self._threads_each)
-            self._workers.append(worker)
+            uptime_s = 0.0 if worker is None else await self._wait_ended(worker)
+            pause_s = self._restarts.next_pause(pause_s, uptime_s)
+            _log.warning("another worker process starts in %g s", pause_s)
+            await asyncio.sleep(pause_s)
+            worker = await self._start_another()
 
-    async def _restart(self) -> Worker:
-        pause = _RESTART_S
-        while True:
-            await asyncio.sleep(pause)
-            try:
-                return await Worker.start(self._setup)
-            except (LanestreamError, OSError) as error:
-                _log.error("a worker process can't be started: %s", error)
-                pause = min(2.0 * pause, _LONGEST_RESTART_S)
+    async def _wait_ended(self, worker: Worker) -> float:
+        """Waits until a worker ends, and returns the seconds for which it lived."""
+        status = await worker.wait_ended()
+        uptime_s = worker.uptime_s
+        self._workers.remove(worker)
+        _log.error("a worker process ended with status %d after %.1f s", status, uptime_s)
+        self._report("hung" if worker.hung else "ended")
+        return uptime_s
+
+    async def _start_another(self) -> Worker | None:
+        """Returns a worker that has begun; None if it can't be started, for any reason, which is logged."""
+        try:
+            worker = await Worker.start(self._setup, self._start_s)
+        except Exception as error:
+            # The errors that an operator can understand without a traceback.
+            is_known = isinstance(error, (LanestreamError, OSError))
+            _log.error("a worker process can't be started: %s", error, exc_info=None if is_known else error)
+            self._report("start_failed")
+            return None
+        worker.begin(self._threads_each, self._frame_s)
+        self._workers.append(worker)
+        self._report("replaced")
+        return worker
+
+    def _supervisor_ended(self, supervisor: asyncio.Task[None]) -> None:
+        if not self._closing:
+            _log.critical(
+                "worker processes that end are no longer replaced, because of an error in this program; restart it",
+                exc_info=None if supervisor.cancelled() else supervisor.exception(),
+            )
+
+    def _report(self, event: WorkerEvent) -> None:
+        if self._observe_worker is not None:
+            self._observe_worker(event)
 
 
-async def _add(workers: list[Worker], setup: WorkerSetup) -> None:
-    workers.append(await Worker.start(setup))
+async def _add(workers: list[Worker], setup: WorkerSetup, start_s: float) -> None:
+    workers.append(await Worker.start(setup, start_s))
 
 
 def default_processes(capabilities: Capabilities) -> int:
@@ -313,7 +260,3 @@ def default_processes(capabilities: Capabilities) -> int:
     memory = memory_limit()
     room = _MOST_PROCESSES if memory is None else max(1, int((memory - _SERVICE_BYTES) / _WORKER_BYTES))
     return min(processors(), room, _MOST_PROCESSES)
-
-
-def _lost() -> WorkerLostError:
-    return WorkerLostError("the process that had the frame has ended", "send the next frame; the service continues")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lanestream.images.decoding import ImageLimits
     from lanestream.inference.batcher import BatchReport
     from lanestream.messages import ProcessedFrame
+    from lanestream.workers.admission import Slot
 
 
 class ThreadPool(WorkerPool):
@@ -39,10 +40,10 @@ class ThreadPool(WorkerPool):
         """Returns a new camera's session, see `WorkerPool.open_session`."""
         return self._engine.open_session(horizon, detector)
 
-    async def run(self, session: SessionHandle, frame: EncodedFrame) -> ProcessedFrame:
+    async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:
         """Returns the lanes of `frame`, see `WorkerPool.run`."""
         assert isinstance(session, Session)  # noqa: S101 - opened here
-        return await self.in_thread(self._worker.process, session, frame)
+        return await self.in_thread(self._worker.process, session, frame, slot.charge)
 
     async def close(self) -> None:
         """Ends the threads after their current work."""

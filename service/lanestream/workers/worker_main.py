@@ -7,6 +7,7 @@ can take any frame, and one that ends loses only the frames that it was processi
 from __future__ import annotations
 
 import logging.config
+import os
 import signal
 import socket
 import sys
@@ -15,6 +16,8 @@ import traceback
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
+from itertools import count
 from typing import TYPE_CHECKING
 
 import cv2
@@ -22,7 +25,15 @@ import cv2
 from lanestream.errors import LanestreamError, one_line
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import FrameWorker
-from lanestream.workers.ipc import FrameDone, FrameJob, WorkerSetup, encode_message, receive_message
+from lanestream.workers.ipc import (
+    FrameDone,
+    FrameJob,
+    WorkerSetup,
+    decode_message,
+    encode_message,
+    receive_bytes,
+    receive_message,
+)
 
 if TYPE_CHECKING:
     from lanestream.engine import Engine
@@ -42,31 +53,39 @@ class WorkerProcess:
         self._sending = threading.Lock()
 
     def serve(self) -> None:
-        """Sends its capabilities, receives the number of threads, and processes frames until the socket is closed."""
-        self._send(Capabilities.of(self._engine))
-        with suppress(EOFError, ConnectionError), ThreadPoolExecutor(receive_message(self._channel)) as threads:
-            while True:
-                threads.submit(self._process, receive_message(self._channel))
+        """Sends its capabilities, receives the number of threads, and processes frames until the socket is closed.
 
-    def _process(self, job: FrameJob) -> None:
+        Frames that are being processed then are left to their threads.
+        """
+        self._channel.sendall(encode_message(Capabilities.of(self._engine)))
+        with suppress(EOFError, ConnectionError):
+            threads = ThreadPoolExecutor(receive_message(self._channel))
+            for number in count():
+                threads.submit(self._process, number, receive_bytes(self._channel))
+
+    def _process(self, number: int, message: bytearray) -> None:
+        costs: list[float] = []
         outcome: FrameOutcome
         try:
+            job: FrameJob = decode_message(message)
             session = self._engine.open_session(job.horizon, job.detector)
             session.restore(job.state)
-            outcome = self._worker.process(session, job.frame), session.state
-        except Exception as error:
+            outcome = self._worker.process(session, job.frame, costs.append), session.state
+        except BaseException as error:  # whatever a thread of the executor would end with, silently
             outcome = portable(error)
-        batches = tuple(self._batches.popleft() for _ in range(len(self._batches)))
-        with suppress(ConnectionError):
-            self._send(FrameDone(job.number, outcome, batches))
+        self._send(FrameDone(number, outcome, sum(costs)))
 
-    def _send(self, value: object) -> None:
-        message = encode_message(value)
-        with self._sending:
+    def _send(self, done: FrameDone) -> None:
+        with self._sending, suppress(ConnectionError):
+            done = replace(done, batches=tuple(self._batches.popleft() for _ in range(len(self._batches))))
+            try:
+                message = encode_message(done)
+            except Exception as error:  # the outcome can't be pickled
+                message = encode_message(replace(done, outcome=portable(error)))
             self._channel.sendall(message)
 
 
-def portable(error: Exception) -> Exception:
+def portable(error: BaseException) -> Exception:
     """Returns an error that can be pickled: a LanestreamError unchanged, any other as text with its traceback."""
     if isinstance(error, LanestreamError):
         return error
@@ -78,7 +97,7 @@ def portable(error: Exception) -> Exception:
 def main(descriptor: int) -> None:
     """Processes frames for the service at the other end of the socket `descriptor`."""
     # The service handles signals for the whole process group: it drains, and closes the socket when it is done.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     with socket.socket(fileno=descriptor) as channel, suppress(EOFError, ConnectionError):
         setup: WorkerSetup = receive_message(channel)
@@ -90,6 +109,8 @@ def main(descriptor: int) -> None:
             channel.sendall(encode_message(portable(error)))
             return
         WorkerProcess(channel, engine, setup.limits).serve()
+        # Nobody waits for the frames in progress, and a thread that hangs must not keep the process.
+        os._exit(0)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def test_ports_are_published_on_this_machine_only_by_default(name: str) -> None:
 
 @pytest.mark.parametrize("name", set(SERVICES) - set(OWN_SERVICES))
 def test_third_party_images_are_pinned(name: str) -> None:
-    assert re.search(r":v?\d", SERVICES[name]["image"])
+    assert re.search(r":v?\d+\.\d+\.\d+\b", SERVICES[name]["image"])
 
 
 def test_a_profile_starts_one_variant_and_all_its_dependencies() -> None:
@@ -72,6 +72,16 @@ def test_the_environment_contains_only_known_settings(name: str) -> None:
 def test_the_grace_period_is_longer_than_draining(name: str) -> None:
     grace = float(SERVICES[name]["stop_grace_period"].removesuffix("s"))
     assert grace >= Settings().drain_s + 10
+
+
+@pytest.mark.parametrize("name", OWN_SERVICES)
+def test_connections_are_limited(name: str) -> None:
+    limits = SERVICES[name]["ulimits"]["nofile"]
+    assert 4096 <= limits["soft"] == limits["hard"]
+    value = SERVICES[name]["environment"]["LANESTREAM_MAX_SESSIONS_PER_CALLER"]
+    default = re.fullmatch(r"\$\{LANESTREAM_MAX_SESSIONS_PER_CALLER:-(\d+)\}", value)
+    assert default is not None
+    assert 1 <= int(default[1]) <= Settings().max_sessions / 2
 
 
 def test_secrets_are_not_committed_and_mounts_exist() -> None:

@@ -207,3 +207,51 @@ def test_close_runs_what_waits_and_accepts_no_more() -> None:
     assert [sums(each.result(0)) for each in submitted] == [[0], [1], [2], [3], [4]]
     with pytest.raises(RuntimeError, match="closed"):
         batcher.submit(model, inputs_of(1))
+
+
+class BrokenModel(fakes.FakeModel):
+    """Fails in ways in which no model should fail."""
+
+    def run(self, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
+        match int(inputs[0, 0, 0, 0]):
+            case 1:
+                return None  # type: ignore[return-value]
+            case 2:
+                raise SystemExit("a library ends the thread")
+            case _:
+                return super().run(inputs)
+
+
+@pytest.mark.parametrize(("value", "error"), [(1, Exception), (2, SystemExit)])
+def test_the_thread_survives_whatever_a_model_does(value: int, error: type[BaseException]) -> None:
+    model, batcher = BrokenModel(), Batcher()
+    with pytest.raises(error):
+        batcher.submit(model, inputs_of(value)).result(fakes.WAIT_S)
+    assert batcher.submit(model, inputs_of(0)).result(fakes.WAIT_S).outputs.shape == (1, 2)
+    with pytest.raises(error):
+        batcher.run(model, inputs_of(value))
+    batcher.close()
+
+
+def test_every_request_of_a_batch_that_ends_its_thread_gets_the_error(caplog: pytest.LogCaptureFixture) -> None:
+    first, model, batcher = SumModel(), BrokenModel(), Batcher()
+    first.may_run.clear()
+    submitted = [batcher.submit(first, inputs_of(0)), *(batcher.submit(model, inputs_of(2)) for _ in range(3))]
+    first.may_run.set()
+    for each in submitted[1:]:
+        with pytest.raises(SystemExit):
+            each.result(fakes.WAIT_S)
+    batcher.close()
+    assert "a batch of 3 requests failed" in caplog.text
+    assert "a library ends the thread" in caplog.text
+
+
+def test_an_observer_that_fails_loses_no_result(caplog: pytest.LogCaptureFixture) -> None:
+    def observe(_: BatchReport) -> None:
+        raise ValueError("the observer failed")
+
+    model, batcher = SumModel(), Batcher(observe)
+    assert [sums(batcher.submit(model, inputs_of(n)).result(fakes.WAIT_S)) for n in range(3)] == [[0], [1], [2]]
+    assert sums(batcher.run(model, inputs_of(3))) == [3]
+    batcher.close()
+    assert "the observer failed" in caplog.text

@@ -17,6 +17,7 @@ from lanestream.errors import ExpiredError, NoDetectorError
 from lanestream.images.decoding import ImageLimits
 from lanestream.messages import ProcessedFrame
 from lanestream.road.view import Image
+from lanestream.workers.admission import Slot
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame
 from lanestream.workers.pool import SessionHandle, WorkerPool
@@ -53,7 +54,7 @@ class IdlePool(WorkerPool):
     def open_session(self, horizon: float | None = None, detector: str | None = None) -> SessionHandle:
         raise NotImplementedError
 
-    async def run(self, session: SessionHandle, frame: EncodedFrame) -> ProcessedFrame:
+    async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:
         raise NotImplementedError
 
 
@@ -64,7 +65,7 @@ def encoded(timestamp: float = 0.0, deadline: float | None = None) -> EncodedFra
 async def run_together(model: CountingModel, threads: int, cameras: int) -> list[ProcessedFrame]:
     """Returns the results of one frame of each camera, all given to the pool at the same time."""
     pool = ThreadPool(fakes.engine(model, ShadeDetector()), ImageLimits(), threads)
-    frames = await asyncio.gather(*(pool.run(pool.open_session(), encoded()) for _ in range(cameras)))
+    frames = await asyncio.gather(*(pool.run(pool.open_session(), encoded(), Slot()) for _ in range(cameras)))
     await pool.close()
     return frames
 
@@ -82,7 +83,7 @@ async def test_frames_of_many_cameras_have_the_same_lanes_as_a_frame_alone(threa
 
 async def test_a_frame_has_the_duration_of_each_stage_which_add_up_to_its_total() -> None:
     pool = ThreadPool(fakes.engine(), ImageLimits(), 1)
-    frame = await pool.run(pool.open_session(), encoded())
+    frame = await pool.run(pool.open_session(), encoded(), Slot())
     await pool.close()
     timing = frame.result.timing_ms
     assert set(timing) == {"decode", "propose", "infer", "fit", "track", "queue", "total"}
@@ -96,7 +97,7 @@ async def test_an_expired_frame_is_never_run_and_leaves_the_session_as_it_was() 
     session = pool.open_session()
     before = session.state
     with pytest.raises(ExpiredError):
-        await pool.run(session, encoded(deadline=time.monotonic() - 1.0))
+        await pool.run(session, encoded(deadline=time.monotonic() - 1.0), Slot())
     await pool.close()
     assert model.batches == []
     assert session.state == before
@@ -128,7 +129,7 @@ async def test_a_pool_admits_one_frame_more_than_its_threads_and_fewer_of_mode_l
         pool = IdlePool(workers, threads)
         async with AsyncExitStack() as stack:
             for _ in range(expected):
-                await stack.enter_async_context(pool.admit(latest=latest))
+                await stack.enter_async_context(pool.admit("camera", latest=latest))
             with pytest.raises(TimeoutError):
-                await asyncio.wait_for(stack.enter_async_context(pool.admit(latest=latest)), 0.05)
+                await asyncio.wait_for(stack.enter_async_context(pool.admit("camera", latest=latest)), 0.05)
         await pool.close()
