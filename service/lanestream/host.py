@@ -11,6 +11,7 @@ import os
 import platform
 import resource
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ _RELEVANT_INSTRUCTION_SETS: Final = (
 # glibc's names for the size from which memory is mapped by itself, and for the free memory that it keeps.
 _M_MMAP_THRESHOLD: Final = -3
 _M_TRIM_THRESHOLD: Final = -1
+_LOW_PRIORITY: Final = 10
 _KEPT_BYTES: Final = 16 << 20
 
 
@@ -103,6 +105,12 @@ def memory() -> float:
     installed = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     limit = memory_limit()
     return installed if limit is None else min(installed, limit)
+
+
+def yield_processor() -> None:
+    """Lowers the priority of the calling thread. Does nothing on systems where priorities belong to processes."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LOW_PRIORITY)
 
 
 def raise_open_files() -> int:
@@ -187,13 +195,27 @@ def _read_memory_limit(group: Path) -> float | None:
     return None if limit >= _UNLIMITED_BYTES else float(limit)
 
 
-def keep_freed_memory() -> None:
-    """Lets the C library keep up to 16 MB of freed memory instead of returning it to the kernel at once.
+def keep_freed_memory(largest: int = _KEPT_BYTES) -> None:
+    """Lets the C library keep up to 16 MB of freed memory, of pieces up to `largest` bytes, for the next allocation.
 
     Every frame allocates and frees the same few megabytes. By default glibc gives most of it back each time, and the
-    page faults of getting it again take longer than some of the work itself. Other C libraries are left as they are.
+    page faults of getting it again take longer than some of the work itself. Larger pieces are always given back: by
+    default glibc would keep even those once they have been freed. Other C libraries are left as they are.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    mallopt = _c_function("mallopt")
     if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES)
+        mallopt(_M_MMAP_THRESHOLD, largest)
         mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+def return_freed_memory() -> None:
+    """Gives all free memory back to the system, also from between what is in use. Takes a few milliseconds."""
+    malloc_trim = _c_function("malloc_trim")
+    if malloc_trim is not None:
+        malloc_trim(0)
+
+
+def _c_function(name: str) -> Callable[..., int] | None:
+    """Returns a function of glibc; None elsewhere."""
+    function: Callable[..., int] | None = getattr(ctypes.CDLL(None), name, None) if sys.platform == "linux" else None
+    return function

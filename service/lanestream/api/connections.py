@@ -10,7 +10,8 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
-from collections import Counter, defaultdict
+import time
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
@@ -43,7 +44,7 @@ _MEANINGS: Final[dict[CutReason, str]] = {
 _PROGRESS_BYTES: Final = 1 << 16
 # How long, and how much, is still read from a peer after the last answer.
 _LINGER_S: Final = 1.0
-_MOST_DISCARDED_BYTES: Final = 1 << 20
+_MOST_DISCARDED_BYTES: Final = 1 << 22
 # An attack must not fill the log: one line for each reason in this time.
 _LOG_EVERY_S: Final = 10.0
 # Requests of one address, on average and as a burst: far more than the service can answer.
@@ -79,7 +80,8 @@ class ConnectionTable:
     """The open connections of a process.
 
     `is_proxy` returns whether an address is that of a trusted proxy, for which the limit per address does not hold.
-    `observe` is called with the reason of every connection that is closed before its peer is done.
+    `observe` is called with the reason of every connection that is closed before its peer is done. `clock` returns
+    monotonic seconds.
     """
 
     def __init__(
@@ -88,12 +90,15 @@ class ConnectionTable:
         budget: ByteBudget,
         is_proxy: Callable[[str], bool],
         observe: Callable[[CutReason], None],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.limits = limits
         self.budget = budget
         self._is_proxy = is_proxy
         self._observe = observe
+        self._clock = clock
         self._requests = TokenBuckets(_REQUESTS_PER_S, _REQUEST_BURST_S)
+        self._turns: dict[str, deque[Callable[[], None]]] = {}
         self._messages = TokenBuckets(_CALLER_RATE * limits.messages_per_s, _MESSAGE_BURST_S)
         # Connections without a session by address, each time the oldest first; a dict is an ordered set.
         self._evictable: defaultdict[str, dict[Connection, None]] = defaultdict(dict)
@@ -129,17 +134,32 @@ class ConnectionTable:
         self._count[address] += 1
         return connection
 
-    def requests(self, address: str, now: float) -> TokenBucket:
-        """Returns the bucket of an address, which has one token for each request."""
-        return self._requests.bucket(address, now)
+    def begin_request(self, address: str, proceed: Callable[[], None]) -> bool:
+        """Returns whether a request of an address may begin now. If not, `proceed` is called as soon as it may.
 
-    def message_bucket(self, now: float) -> TokenBucket:
+        The connections of an address take turns, so that one that sends as fast as it can does not keep others waiting.
+        """
+        bucket = self._requests.bucket(address, self._clock())
+        if address not in self._turns and bucket.covers(1.0, self._clock()):
+            bucket.spend(1.0)
+            return True
+        if address not in self._turns:
+            self._turns[address] = deque()
+            self._schedule_turn(address)
+        self._turns[address].append(proceed)
+        return False
+
+    def count_request(self, address: str) -> None:
+        """Counts a request that has begun without `begin_request`, behind the body of another one."""
+        self._requests.bucket(address, self._clock()).spend(1.0)
+
+    def message_bucket(self) -> TokenBucket:
         """Returns the bucket of a new WebSocket, see `ConnectionLimits.messages_per_s`."""
-        return TokenBucket(self.limits.messages_per_s, _MESSAGE_BURST_S, now)
+        return TokenBucket(self.limits.messages_per_s, _MESSAGE_BURST_S, self._clock())
 
-    def account_messages(self, account: str, now: float) -> TokenBucket:
+    def account_messages(self, account: str) -> TokenBucket:
         """Returns the bucket of all WebSockets of a caller or address."""
-        return self._messages.bucket(account, now)
+        return self._messages.bucket(account, self._clock())
 
     def protect(self, connection: Connection) -> None:
         """Keeps a connection from being closed in favor of another: it has a session now."""
@@ -171,8 +191,9 @@ class ConnectionTable:
         for connection in [*self._with_session, *(each for group in self._evictable.values() for each in group)]:
             connection.abort()
 
-    def report(self, reason: CutReason, address: str, now: float) -> None:
+    def report(self, reason: CutReason, address: str) -> None:
         """Counts and logs that a connection was cut."""
+        now = self._clock()
         self._observe(reason)
         if now < self._next_log.get(reason, 0.0):
             self._unlogged[reason] += 1
@@ -182,6 +203,20 @@ class ConnectionTable:
         _log.warning(
             "closed a connection from %s: %s%s", address, _MEANINGS[reason], f" ({more} more before)" if more else ""
         )
+
+    def _schedule_turn(self, address: str) -> None:
+        wait_s = self._requests.bucket(address, self._clock()).seconds_until(1.0, self._clock())
+        asyncio.get_running_loop().call_later(wait_s, self._next_turn, address)
+
+    def _next_turn(self, address: str) -> None:
+        turns, bucket = self._turns[address], self._requests.bucket(address, self._clock())
+        while turns and bucket.covers(1.0, self._clock()):
+            bucket.spend(1.0)
+            turns.popleft()()
+        if turns:
+            self._schedule_turn(address)
+        else:
+            del self._turns[address]
 
     def _make_room(self, address: str) -> bool:
         """Closes a connection if there are too many for another one. Returns False if none may be closed."""
@@ -242,7 +277,7 @@ class Connection(asyncio.Transport):
         self._due = 0
         self._progress_timer: asyncio.TimerHandle | None = None
         self._paused = self._held = self._reading_stopped = False
-        self._lingering = False
+        self._lingering = self._ended = False
         self._discarded = 0
 
     def identify(self, caller: str) -> None:
@@ -259,12 +294,13 @@ class Connection(asyncio.Transport):
 
     def cut(self, reason: CutReason) -> None:
         """Closes the connection at once, without sending what still waits, and reports why."""
-        self.table.report(reason, self.address, self._loop.time())
+        self.table.report(reason, self.address)
         self.table.discard(self)
         self.abort()
 
     def lost(self) -> None:
         """Forgets the connection; its protocol calls this when it is closed."""
+        self._ended = True
         self.table.discard(self)
         if self._progress_timer is not None:
             self._progress_timer.cancel()
@@ -307,7 +343,9 @@ class Connection(asyncio.Transport):
         self._update_reading()
 
     def write(self, data: bytes | bytearray | memoryview[Any]) -> None:
-        """Sends data when the peer takes it."""
+        """Sends data when the peer takes it. Does nothing after the last answer."""
+        if self._ended or self._lingering:
+            return
         self._transport.write(data)
         self._written += len(data)
         if self._progress_timer is None and self._transport.get_write_buffer_size():
@@ -325,6 +363,7 @@ class Connection(asyncio.Transport):
 
     def abort(self) -> None:
         """Closes the connection at once."""
+        self._ended = True
         self._transport.abort()
 
     def is_closing(self) -> bool:

@@ -35,6 +35,9 @@ _MOST_WAITING_REQUESTS: Final = 32
 # A head is parsed in small pieces: a piece may contain many requests.
 _HEAD_PIECE: Final = 512
 _BODY_PIECE: Final = 1 << 16
+# The rest of a body that is read after its answer, so that the connection can be used again.
+_MOST_UNWANTED_BYTES: Final = 1 << 18
+_HEAD_END: Final = b"\r\n\r\n"
 # The application answers a slow body itself at its time limit; the connection is closed a little later.
 _BODY_GRACE_S: Final = 2.0
 
@@ -58,8 +61,9 @@ class HttpConnection(_HttpProtocol):
         self._refusal: HTTPStatus | None = None
         self._over = False
         self._between_requests = True
+        self._has_turn = self._waits_for_turn = False
         self._in_body = False
-        self._head_bytes = self._headers_received = 0
+        self._head_bytes = self._headers_received = self._unwanted_bytes = 0
         self._got_body = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -92,9 +96,11 @@ class HttpConnection(_HttpProtocol):
         super().on_message_begin()
         assert self._connection is not None  # noqa: S101 - data came over it
         self.scope["state"][STATE_KEY] = self._connection
-        self._head_bytes = self._headers_received = 0
+        self._head_bytes = self._headers_received = self._unwanted_bytes = 0
         self._between_requests = self._in_body = False
-        self._table.requests(self._connection.address, self.loop.time()).spend(1.0)
+        if not self._has_turn:
+            self._table.count_request(self._connection.address)
+        self._has_turn = False
         self._expect("head", self._table.limits.head_s)
 
     def on_url(self, url: bytes) -> None:
@@ -125,8 +131,12 @@ class HttpConnection(_HttpProtocol):
     def on_body(self, body: bytes) -> None:
         """Receives a part of the body."""
         self._got_body = True
-        if not self._over and self._refusal is None:
-            super().on_body(body)
+        if self._over or self._refusal is not None:
+            return
+        super().on_body(body)
+        self._unwanted_bytes += len(body) if self.cycle.response_complete else 0
+        if self._unwanted_bytes > _MOST_UNWANTED_BYTES:
+            self._end()
 
     def on_message_complete(self) -> None:
         """Ends the time limit of the request: what follows is the service's own work."""
@@ -141,7 +151,7 @@ class HttpConnection(_HttpProtocol):
     def on_response_complete(self) -> None:
         """Continues with the next request, or waits for it."""
         super().on_response_complete()
-        if self._between_requests and not self.pipeline:
+        if self._between_requests and not self.pipeline and not self._over:
             self._expect_next_request()
         if self._unread:
             self.loop.call_soon(self._parse)
@@ -150,18 +160,19 @@ class HttpConnection(_HttpProtocol):
         """Passes the connection on to the WebSocket protocol."""
         if self._refusal is not None:
             return
+        assert self._connection is not None  # noqa: S101 - the request came over it
+        self._over = True
         self._cancel_timer()
         self._unread.clear()
-        self._over = True
+        self._connection.hold_reading(False)
         super().handle_websocket_upgrade()
 
     def _parse(self) -> None:
         """Feeds the parser piece by piece, until a request waits for an earlier answer or the peer is too fast."""
         while self._unread and not self._over and not self.pipeline:
-            if self._between_requests and (wait_s := self._request_wait_s()):
-                self.loop.call_later(wait_s, self._parse)
+            if self._between_requests and not self._take_turn():
                 break
-            size = _BODY_PIECE if self._in_body else _HEAD_PIECE
+            size = self._piece_size()
             piece = bytes(self._unread[:size])
             del self._unread[:size]
             self._got_body = False
@@ -179,10 +190,24 @@ class HttpConnection(_HttpProtocol):
         if self._refusal is not None:
             self._refuse(self._refusal)
 
-    def _request_wait_s(self) -> float:
+    def _piece_size(self) -> int:
+        """Returns how much to parse at a time: a part of a body, or of a head up to its end."""
+        if self._in_body:
+            return _BODY_PIECE
+        end = self._unread.find(_HEAD_END, 0, _HEAD_PIECE)
+        return _HEAD_PIECE if end < 0 else end + len(_HEAD_END)
+
+    def _take_turn(self) -> bool:
+        """Returns whether the next request may begin; if not, it begins as soon as it may."""
         assert self._connection is not None  # noqa: S101 - data came over it
-        now = self.loop.time()
-        return self._table.requests(self._connection.address, now).seconds_until(1.0, now)
+        if not self._has_turn and not self._waits_for_turn:
+            self._has_turn = self._table.begin_request(self._connection.address, self._proceed)
+            self._waits_for_turn = not self._has_turn
+        return self._has_turn
+
+    def _proceed(self) -> None:
+        self._has_turn, self._waits_for_turn = True, False
+        self._parse()
 
     def _expect(self, what: CutReason, seconds: float) -> None:
         self._cancel_timer()
@@ -206,12 +231,18 @@ class HttpConnection(_HttpProtocol):
     def _refuse(self, status: HTTPStatus) -> None:
         """Answers the head of a request with an error, unless an earlier request is being answered, and closes."""
         assert self._connection is not None  # noqa: S101 - only a connection that was admitted has requests
-        self._over = True
-        self._cancel_timer()
         if self.cycle is None or self.cycle.response_complete:
             message = f"the head of the request is refused: {status.phrase.lower()}"
             self._connection.write(raw_response(status, status.name.lower(), message, _HINTS[status]))
-        self._table.report("head", self._connection.address, self.loop.time())
+        self._table.report("head", self._connection.address)
+        self._end()
+
+    def _end(self) -> None:
+        """Closes the connection after the last answer, whatever the peer still sends."""
+        assert self._connection is not None  # noqa: S101 - only a connection that was admitted has requests
+        self._over = True
+        self._cancel_timer()
+        self._unread.clear()
         self._connection.linger()
 
     def _cut(self, reason: CutReason) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import gc
 import ipaddress
 import logging
 import os
@@ -24,7 +25,7 @@ from lanestream.api.auth import warn_if_open
 from lanestream.api.http_connection import HttpConnection
 from lanestream.api.websocket_connection import WebSocketConnection
 from lanestream.errors import SettingsError
-from lanestream.host import raise_open_files
+from lanestream.host import keep_freed_memory, raise_open_files, return_freed_memory
 from lanestream.logs import flush_logs, log_config
 from lanestream.workers.ipc import WorkerSetup
 from lanestream.workers.process_pool import ProcessPool
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _BACKLOG: Final = 2048
+_LARGEST_KEPT_BYTES: Final = 1 << 20
+_RETURN_MEMORY_S: Final = 10.0
 # Files that the process needs besides its connections: models, pipes to workers, Redis, logs.
 _OTHER_FILES: Final = 128
 # After a drain, how long uvicorn waits for peers to close their connections.
@@ -58,6 +61,8 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None
     """
     # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
     cv2.setNumThreads(settings.opencv_threads)
+    # Images and messages of a few megabytes come and go, and must not add up.
+    keep_freed_memory(_LARGEST_KEPT_BYTES)
     app = create_app(None, settings, draw)
     app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     listener = listen(settings.host, settings.port)
@@ -92,7 +97,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         # Without proxies, no header may change the address of a caller.
         proxy_headers=bool(service.proxies),
         forwarded_allow_ips=service.proxies or None,
-        timeout_graceful_shutdown=_CLOSE_S,  # type: ignore[arg-type]
+        timeout_graceful_shutdown=2.0 * _CLOSE_S,  # type: ignore[arg-type]
         log_config=log_config(settings),
     )
 
@@ -140,9 +145,9 @@ class LanestreamServer(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drains the streams, then shuts uvicorn down, which closes the sockets."""
         await self._service.drain()
+        # Before uvicorn's own limit, which would cancel what still sends to them.
+        asyncio.get_running_loop().call_later(_CLOSE_S, self._service.connections.abort_all)
         await super().shutdown(sockets)
-        self._service.connections.abort_all()
-        await asyncio.sleep(0.0)  # so that the event loop closes them
 
 
 async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
@@ -161,7 +166,22 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
         server.should_exit = True
         await serving
         raise
+    cleaning = asyncio.create_task(_return_memory())
     await serving
+    cleaning.cancel()
+
+
+async def _return_memory() -> None:
+    """Gives the memory of closed connections back to the system from time to time.
+
+    Python finds what refers to itself, like a connection and its tasks, only when many new objects have been made,
+    however large they are. What exists now is left out, so that looking takes a few milliseconds.
+    """
+    gc.freeze()
+    while True:
+        await asyncio.sleep(_RETURN_MEMORY_S)
+        gc.collect()
+        return_freed_memory()
 
 
 async def _start_pool(service: Service, load: Callable[[], Engine]) -> WorkerPool:

@@ -278,7 +278,7 @@ class StreamConnection:
         """Raises the error, which ends the stream for good, if the stream's frames have cost several workers."""
         if isinstance(error, WorkerLostError):
             answered = self._protocol.answered
-            # Frames that were in process beside the one that ended the worker are not held against their stream for long.
+            # A frame that was in process beside the one that ended the worker is not held against its stream for long.
             self._worker_losses = 1 if answered - self._answered_at_loss > _FORGIVEN_AFTER else self._worker_losses + 1
             self._answered_at_loss = answered
             if self._worker_losses >= _MOST_WORKER_LOSSES:

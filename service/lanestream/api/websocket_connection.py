@@ -47,6 +47,7 @@ _FINAL_BIT: Final = 0x80
 _OPCODE_BITS: Final = 0x0F
 _MASK_BIT: Final = 0x80
 _MASK_BYTES: Final = 4
+_MOST_CONTROL_BYTES: Final = 125
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class WebSocketConnection(_WebSocketProtocol):
         """Takes the connection over."""
         assert isinstance(transport, Connection)  # noqa: S101 - passed on by HttpConnection
         self._connection = transport
-        self._bucket = transport.table.message_bucket(self.loop.time())
+        self._bucket = transport.table.message_bucket()
         self._charge = transport.table.budget.charge(transport.account)
         super().connection_made(transport)
 
@@ -200,22 +201,23 @@ class WebSocketConnection(_WebSocketProtocol):
     def _is_acceptable(self, header: FrameHeader) -> bool:
         """Refuses a frame by its header. Returns whether it may be waited for."""
         if not header.is_data:
-            # The library refuses what is longer than a control frame may be.
-            return header.payload <= 125 or self._refuse_size("a control frame has more than 125 bytes")
+            if header.payload > _MOST_CONTROL_BYTES:
+                self._fail(1002, f"a control frame has more than {_MOST_CONTROL_BYTES} bytes")
+            return header.payload <= _MOST_CONTROL_BYTES
         text = header.opcode == _TEXT or (header.opcode == _CONTINUATION and self._in_text)
         most = MOST_TEXT_BYTES if text else self.config.ws_max_size
         size = header.payload + (self._message_bytes if header.opcode == _CONTINUATION else 0)
         return size <= most or self._refuse_size(f"a message has more than {most:,} bytes")
 
     def _refuse_size(self, reason: str) -> bool:
-        self._connection.table.report("message_size", self._connection.address, self.loop.time())
+        self._connection.table.report("message_size", self._connection.address)
         self._fail(1009, reason)
         return False
 
     def _spend(self, header: FrameHeader) -> bool:
         """Takes the tokens for a frame. If they are missing, returns False and continues when they are there."""
         now, cost = self.loop.time(), _MESSAGE_COST if header.is_data and header.final else 1.0
-        buckets = self._bucket, self._connection.table.account_messages(self._connection.account, now)
+        buckets = self._bucket, self._connection.table.account_messages(self._connection.account)
         wait_s = max(bucket.seconds_until(cost, now) for bucket in buckets)
         if wait_s > 0.0:
             if self._timer is None:
@@ -248,7 +250,7 @@ class WebSocketConnection(_WebSocketProtocol):
         except BusyError as error:
             self._full_since = self._full_since or now
             if now - self._full_since > self._connection.table.limits.send_s:
-                self._connection.table.report("memory", self._connection.address, now)
+                self._connection.table.report("memory", self._connection.address)
                 self.conn.send_text(error_message(error, fatal=True).model_dump_json().encode())
                 self._fail(wire_status(error).close_code, error.message)
             elif self._timer is None:

@@ -40,8 +40,8 @@ _PNG_OPTIONAL: Final = 0x20
 _PNG_CHANNELS: Final = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 # Deflate expands one byte to at most this many. A decoder inflates all data, even those beyond the last pixel.
 _DEFLATE_RATIO: Final = 1032
-# Bytes beyond the pixels that a decoder may inflate. They take less than a fifth of a second. Files too small to hold as
-# many are not checked, since the check takes as long as decoding.
+# Bytes beyond the pixels that a decoder may inflate, which takes less than a fifth of a second. Files too small to hold
+# so many are not checked, since the check takes as long as decoding.
 _MAX_EXCESS_BYTES: Final = 1 << 26
 _INFLATE_STEP: Final = 1 << 18
 

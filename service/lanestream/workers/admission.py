@@ -24,8 +24,9 @@ _FIRST_COST_S: Final = 0.02
 
 @dataclass(eq=False)
 class Slot:
-    """A frame's permission to be processed, and what it has cost so far in seconds of processor time."""
+    """A frame's permission to be processed; what it is expected to cost, and has cost, in seconds of processor time."""
 
+    expected_s: float = _FIRST_COST_S
     cost_s: float = 0.0
 
     def charge(self, seconds: float) -> None:
@@ -36,7 +37,7 @@ class Slot:
 @dataclass(eq=False)
 class _Waiter:
     latest: bool
-    estimate_s: float = 0.0
+    slot: Slot = field(default_factory=Slot)
     admitted: asyncio.Future[None] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
 
 
@@ -54,8 +55,8 @@ class _Account:
 class FairSemaphore:
     """Admits frames to `slots`; at most `latest_slots` of them for frames of mode `latest`.
 
-    While several callers are active, each may hold `per_caller` slots: a frame is never interrupted, so costly ones
-    must not occupy every processor. The frames of one caller are admitted in their order, except that one of mode
+    A caller that has used more than another active one may hold `per_caller` slots: a frame is never interrupted, so
+    costly ones must not occupy every processor. The frames of one caller are admitted in their order, except that one of mode
     `latest` that may not take a free slot keeps its position. `clock` returns monotonic seconds. Belongs to one event
     loop.
     """
@@ -77,7 +78,7 @@ class FairSemaphore:
         if not account.queue and not account.held:
             account.used_s = max(account.used_s, self._virtual_s)
         account.active_at = self._clock()
-        waiter, slot = _Waiter(latest), Slot()
+        waiter = _Waiter(latest)
         account.queue.append(waiter)
         self._admit()
         try:
@@ -86,12 +87,12 @@ class FairSemaphore:
             if waiter in account.queue:
                 account.queue.remove(waiter)
             else:  # admitted at the moment it was canceled
-                self._release(account, waiter, slot)
+                self._release(account, waiter)
             raise
         try:
-            yield slot
+            yield waiter.slot
         finally:
-            self._release(account, waiter, slot)
+            self._release(account, waiter)
 
     def _admit(self) -> None:
         """Gives the free slots away, each to the caller that has used the least time of those that may take it."""
@@ -102,7 +103,7 @@ class FairSemaphore:
 
     def _take_slot(self, account: _Account) -> bool:
         """Gives a slot to the first frame of a caller that may take one. Returns False if none may."""
-        if account.held >= self._per_caller and not self._is_alone(account):
+        if account.held >= self._per_caller and self._has_used_more(account):
             return False
         waiter = next((each for each in account.queue if self._latest_slots or not each.latest), None)
         if waiter is None:
@@ -112,26 +113,27 @@ class FairSemaphore:
         self._latest_slots -= waiter.latest
         self._virtual_s = max(self._virtual_s, account.used_s)
         # Charged now, so that several free slots do not all go to one caller; corrected when the cost is known.
-        waiter.estimate_s = account.mean_cost_s
-        account.used_s += waiter.estimate_s
+        waiter.slot.expected_s = account.mean_cost_s
+        account.used_s += waiter.slot.expected_s
         account.held += 1
         if not waiter.admitted.done():
             waiter.admitted.set_result(None)
         return True
 
-    def _is_alone(self, account: _Account) -> bool:
-        """Returns whether no other caller is active."""
+    def _has_used_more(self, account: _Account) -> bool:
+        """Returns whether another caller is active and has used less."""
         since = self._clock() - _ACTIVE_S
-        return not any(
-            other is not account and (other.queue or other.held or other.active_at > since)
+        return any(
+            other.used_s < account.used_s and (other.queue or other.held or other.active_at > since)
             for other in self._accounts.values()
         )
 
-    def _release(self, account: _Account, waiter: _Waiter, slot: Slot) -> None:
+    def _release(self, account: _Account, waiter: _Waiter) -> None:
+        slot = waiter.slot
         self._slots += 1
         self._latest_slots += waiter.latest
         account.held -= 1
-        account.used_s += slot.cost_s - waiter.estimate_s
+        account.used_s += slot.cost_s - slot.expected_s
         account.mean_cost_s += _GAIN * (slot.cost_s - account.mean_cost_s)
         account.active_at = self._clock()
         self._settle()

@@ -38,10 +38,18 @@ class WorkerPool(ABC):
     """Processes encoded frames: those of one session one at a time, those of different sessions in parallel.
 
     Frames wait for admission before any work on them, so under any load a frame that has started is finished soon.
-    There are `workers` processes with `threads_each`; `own_threads` threads of this process do other work.
+    There are `workers` processes with `threads_each`; `own_threads` threads of this process do other work, after each
+    has called `prepare_thread`.
     """
 
-    def __init__(self, capabilities: Capabilities, workers: int, threads_each: int, own_threads: int) -> None:
+    def __init__(
+        self,
+        capabilities: Capabilities,
+        workers: int,
+        threads_each: int,
+        own_threads: int,
+        prepare_thread: Callable[[], None] | None = None,
+    ) -> None:
         self.capabilities = capabilities
         # Each process gets one frame more than it has threads, so that a thread that becomes free continues without
         # waiting for the event loop. Frames of mode `latest` leave two of many threads idle: for them, latency matters
@@ -52,7 +60,7 @@ class WorkerPool(ABC):
             latest_slots=workers * max(1, threads_each - 2),
             per_caller=(parallel + 1) // 2,
         )
-        self._threads = ThreadPoolExecutor(own_threads, thread_name_prefix="lanestream-frames")
+        self._threads = ThreadPoolExecutor(own_threads, "lanestream-frames", initializer=prepare_thread)
 
     @property
     def works(self) -> bool:

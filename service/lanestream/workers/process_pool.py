@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import LanestreamError, NotReadyError, WorkerLostError
-from lanestream.host import memory_limit, processors
+from lanestream.host import memory_limit, processors, yield_processor
 from lanestream.inference.providers import PROVIDERS
 from lanestream.session import SessionState
 from lanestream.tracking.tracker import LaneTracker
@@ -72,7 +72,7 @@ class RemoteSession:
 
 
 class ProcessPool(WorkerPool):
-    """Sends each frame, with the state of its session, to the worker process that has the fewest frames.
+    """Sends each frame, with the state of its session, to the worker process that is expected to be free first.
 
     Workers that end are replaced as `restarts` says. One that takes `frame_s` seconds for a frame is killed; so is a
     new one that is not ready after `start_s` seconds. `observe`, if given, gets the report of every batch that their
@@ -90,7 +90,8 @@ class ProcessPool(WorkerPool):
         restarts: RestartPolicy = _RESTARTS,
         observe_worker: Callable[[WorkerEvent], None] | None = None,
     ) -> None:
-        super().__init__(workers[0].capabilities, len(workers), threads, processors())
+        # Its own threads only draw pictures, which may take longer for the sake of the event loop and the workers.
+        super().__init__(workers[0].capabilities, len(workers), threads, processors(), yield_processor)
         self._setup = setup
         self._workers = workers
         self._threads_each = threads
@@ -179,8 +180,8 @@ class ProcessPool(WorkerPool):
 
     async def _process(self, job: FrameJob, slot: Slot) -> FrameDone:
         while alive := self._alive:
-            worker = min(alive, key=lambda each: (each.is_slow, each.pending))
-            outcome = await worker.submit(job)
+            worker = min(alive, key=lambda each: (each.is_slow, each.backlog_s))
+            outcome = await worker.submit(job, slot.expected_s)
             if isinstance(outcome, FrameDone):
                 slot.charge(outcome.cpu_s)
                 return outcome

@@ -26,6 +26,8 @@ _PROGRAM: Final = "lanestream.workers.worker_main"
 _END_S: Final = 1.0
 # A worker with a frame that takes longer gets new frames only if all workers have such frames.
 _SLOW_S: Final = 1.0
+# What a frame counts for that takes longer than expected.
+_LEAST_S: Final = 0.005
 # The time of frames is counted in steps: after the service was suspended, only one step has passed, not all.
 _STEP_S: Final = 0.25
 
@@ -42,8 +44,12 @@ class FrameLost:
 
 @dataclass(eq=False)
 class _PendingFrame:
-    """An unfinished frame: when it was begun (monotonic seconds; None while it waits), and its time in whole steps."""
+    """An unfinished frame: how long it is expected to take, when it was begun, and its time in whole steps.
 
+    All in seconds; `begun_at` is monotonic, and None while the frame waits.
+    """
+
+    expected_s: float
     outcome: asyncio.Future[FrameDone | FrameLost]
     begun_at: float | None = None
     counted_s: float = 0.0
@@ -115,9 +121,13 @@ class Worker:
         return self._process.pid
 
     @property
-    def pending(self) -> int:
-        """The number of its unfinished frames."""
-        return len(self._frames)
+    def backlog_s(self) -> float:
+        """The processor time that its unfinished frames are expected to take yet (seconds)."""
+        now = time.monotonic()
+        return sum(
+            max(frame.expected_s - (0.0 if frame.begun_at is None else now - frame.begun_at), _LEAST_S)
+            for frame in self._frames.values()
+        )
 
     @property
     def is_slow(self) -> bool:
@@ -138,10 +148,10 @@ class Worker:
         self._listening = asyncio.create_task(self._listen())
         self._watching = asyncio.create_task(self._watch(frame_s))
 
-    def submit(self, job: FrameJob) -> asyncio.Future[FrameDone | FrameLost]:
-        """Sends a frame to the worker and returns its future outcome."""
+    def submit(self, job: FrameJob, expected_s: float) -> asyncio.Future[FrameDone | FrameLost]:
+        """Sends a frame, which is expected to take `expected_s` seconds, and returns its future outcome."""
         message = encode_message(job)
-        frame = _PendingFrame(asyncio.get_running_loop().create_future())
+        frame = _PendingFrame(expected_s, asyncio.get_running_loop().create_future())
         self._frames[next(self._numbers)] = frame
         self._mark_begun()
         self._writer.write(message)

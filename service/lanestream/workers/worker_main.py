@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import logging.config
 import os
+import select
 import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import cv2
 
 from lanestream.errors import LanestreamError, one_line
+from lanestream.host import return_freed_memory
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import FrameWorker
 from lanestream.workers.ipc import (
@@ -40,6 +43,10 @@ if TYPE_CHECKING:
     from lanestream.images.decoding import ImageLimits
     from lanestream.inference.batcher import BatchReport
     from lanestream.workers.ipc import FrameOutcome
+
+
+# How often free memory goes back to the system at most, so that a few large images do not occupy it for good.
+_RETURN_MEMORY_S: Final = 5.0
 
 
 class WorkerProcess:
@@ -60,7 +67,13 @@ class WorkerProcess:
         self._channel.sendall(encode_message(Capabilities.of(self._engine)))
         with suppress(EOFError, ConnectionError):
             threads = ThreadPoolExecutor(receive_message(self._channel))
+            returned_at = time.monotonic()
             for number in count():
+                # Goes on when a frame comes, or after a pause.
+                select.select([self._channel], [], [], _RETURN_MEMORY_S)
+                if time.monotonic() - returned_at >= _RETURN_MEMORY_S:
+                    return_freed_memory()
+                    returned_at = time.monotonic()
                 threads.submit(self._process, number, receive_bytes(self._channel))
 
     def _process(self, number: int, message: bytearray) -> None:
