@@ -44,13 +44,13 @@ def is_closed(connection: socket.socket) -> bool:
     return True
 
 
-def send_endlessly(connection: socket.socket, data: bytes, limit: int = 1 << 24) -> int:
-    """Sends `data` again and again until the service closes the connection. Returns the bytes sent, at most `limit`."""
+def send_until_closed(connection: socket.socket, data: bytes, limit: int = 1 << 24) -> None:
+    """Sends `data` again and again until the service closes the connection. Fails if it has not after `limit` bytes."""
     sent = 0
-    with suppress(ConnectionError, TimeoutError):
+    with suppress(ConnectionError):
         while sent < limit:
             sent += connection.send(data)
-    return sent
+        raise AssertionError(f"the service has read {sent:,} bytes")
 
 
 def frame(opcode: int, payload: bytes = b"", *, final: bool = True) -> bytes:

@@ -10,10 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import fakes
+import httpx
 import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from wsclient import receive, receive_close, send_message, stream, wait_until_read, wait_until_released
+
+from lanestream.detection.interface import Detections, FrameContext, Infer
+from lanestream.errors import WorkerLostError
+from lanestream.road.view import Image
+from lanestream.workers.thread_pool import ThreadPool
 
 Serve = Callable[..., str]
 README = Path(__file__).parents[2] / "README.md"
@@ -346,3 +352,41 @@ def test_streams_do_not_affect_each_other(url: str) -> None:
                 assert (answer["seq"], answer["width"]) == (seq, width)
                 assert answer["horizon"] == pytest.approx(horizon, abs=0.5), "half a pixel of a resized image"
                 assert [lane["track_id"] for lane in answer["lanes"]] == [1, 2]
+
+
+class LosingDetector(fakes.FakeDetector):
+    """Reports dark frames as the cause of the loss of a worker process."""
+
+    def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
+        if image.mean() < 10.0:
+            raise WorkerLostError("the process that had the frame has ended")
+        return super().detect(image, context, infer)
+
+
+def test_a_stream_whose_frames_cost_several_workers_is_ended_for_good(serve: Serve) -> None:
+    url = serve(fakes.engine(detector=LosingDetector()))
+    with stream(url) as socket:
+        send_message(socket, "start", mode="all")
+        token = receive(socket)["resume_token"]
+        for shade in (0, 128, 0):
+            socket.send(fakes.image_file(shade=shade))
+        answers = [receive(socket) for _ in range(3)]
+        assert [answer.get("code", "lanes") for answer in answers] == ["worker_lost", "lanes", "worker_lost"]
+        assert not any(answer.get("fatal") for answer in answers)
+        socket.send(fakes.image_file(shade=0))
+        last = receive(socket)
+        assert (last["code"], last["fatal"]) == ("worker_lost", True)
+        assert receive_close(socket)[0] == 1013
+    with stream(url) as socket:
+        send_message(socket, "start", resume_token=token)
+        assert receive(socket)["resumed"] is False
+
+
+def test_a_service_that_can_no_longer_replace_its_workers_says_that_it_needs_a_restart(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = serve(fakes.engine())
+    assert httpx.get(f"{url}/healthz").status_code == 200
+    monkeypatch.setattr(ThreadPool, "upkeep_failed", True)
+    response = httpx.get(f"{url}/healthz")
+    assert (response.status_code, response.json()["code"]) == (503, "not_ready")

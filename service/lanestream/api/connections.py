@@ -122,16 +122,16 @@ class ConnectionTable:
                 per_address=min(self.limits.per_address, most),
             )
 
-    def admit(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> Connection | None:
-        """Returns the connection of a transport; None, after closing it, if every other one has a session."""
+    def admit(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> Connection:
+        """Returns the connection of a transport, which is closed already if every other one has a session."""
         peer = transport.get_extra_info("peername")
         address = _network(str(peer[0])) if isinstance(peer, tuple) else _NO_ADDRESS
         connection = Connection(transport, address, self, loop)
-        if not self._make_room(address):
+        if self._make_room(address):
+            self._evictable[address][connection] = None
+            self._count[address] += 1
+        else:
             connection.cut("full")
-            return None
-        self._evictable[address][connection] = None
-        self._count[address] += 1
         return connection
 
     def begin_request(self, address: str, proceed: Callable[[], None]) -> bool:

@@ -52,10 +52,12 @@ _HINTS: Final = {
 class HttpConnection(_HttpProtocol):
     """HTTP/1.1 on one connection of `table`, which has the limits."""
 
+    # It exists from `connection_made` on, before any other event.
+    _connection: Connection
+
     def __init__(self, table: ConnectionTable, **uvicorn: Any) -> None:
         super().__init__(**uvicorn)
         self._table = table
-        self._connection: Connection | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._unread = bytearray()
         self._refusal: HTTPStatus | None = None
@@ -69,23 +71,22 @@ class HttpConnection(_HttpProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Takes the connection, if there may be another one."""
         self._connection = self._table.admit(transport, self.loop)
-        if self._connection is None:
-            self._over = True
-            return
-        super().connection_made(self._connection)
-        self._expect("head", self._table.limits.head_s)
+        self._over = self._connection.is_closing()
+        if not self._over:
+            super().connection_made(self._connection)
+            self._expect("head", self._table.limits.head_s)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stops the timers: the peer is gone."""
         self._over = True
         self._cancel_timer()
-        if self._connection is not None:
+        if self.transport is not None:
             super().connection_lost(exc)
-            self._connection.lost()
+        self._connection.lost()
 
     def data_received(self, data: bytes) -> None:
         """Parses what the peer has sent."""
-        if self._connection is not None and not self._connection.discard(data):
+        if not self._connection.discard(data):
             self._unread += data
             self._parse()
 
@@ -94,7 +95,6 @@ class HttpConnection(_HttpProtocol):
         if self._over:
             return
         super().on_message_begin()
-        assert self._connection is not None  # noqa: S101 - data came over it
         self.scope["state"][STATE_KEY] = self._connection
         self._head_bytes = self._headers_received = self._unwanted_bytes = 0
         self._between_requests = self._in_body = False
@@ -160,7 +160,6 @@ class HttpConnection(_HttpProtocol):
         """Passes the connection on to the WebSocket protocol."""
         if self._refusal is not None:
             return
-        assert self._connection is not None  # noqa: S101 - the request came over it
         self._over = True
         self._cancel_timer()
         self._unread.clear()
@@ -178,7 +177,7 @@ class HttpConnection(_HttpProtocol):
             self._got_body = False
             super().data_received(piece)
             self._check_head(len(piece))
-        if self._connection is not None and not self._over:
+        if not self._over:
             self._connection.hold_reading(bool(self._unread))
 
     def _check_head(self, received: int) -> None:
@@ -199,7 +198,6 @@ class HttpConnection(_HttpProtocol):
 
     def _take_turn(self) -> bool:
         """Returns whether the next request may begin; if not, it begins as soon as it may."""
-        assert self._connection is not None  # noqa: S101 - data came over it
         if not self._has_turn and not self._waits_for_turn:
             self._has_turn = self._table.begin_request(self._connection.address, self._proceed)
             self._waits_for_turn = not self._has_turn
@@ -230,7 +228,6 @@ class HttpConnection(_HttpProtocol):
 
     def _refuse(self, status: HTTPStatus) -> None:
         """Answers the head of a request with an error, unless an earlier request is being answered, and closes."""
-        assert self._connection is not None  # noqa: S101 - only a connection that was admitted has requests
         if self.cycle is None or self.cycle.response_complete:
             message = f"the head of the request is refused: {status.phrase.lower()}"
             self._connection.write(raw_response(status, status.name.lower(), message, _HINTS[status]))
@@ -239,14 +236,12 @@ class HttpConnection(_HttpProtocol):
 
     def _end(self) -> None:
         """Closes the connection after the last answer, whatever the peer still sends."""
-        assert self._connection is not None  # noqa: S101 - only a connection that was admitted has requests
         self._over = True
         self._cancel_timer()
         self._unread.clear()
         self._connection.linger()
 
     def _cut(self, reason: CutReason) -> None:
-        assert self._connection is not None  # noqa: S101 - only a connection that was admitted has requests
         self._over = True
         self._cancel_timer()
         self._connection.cut(reason)

@@ -56,9 +56,9 @@ class FairSemaphore:
     """Admits frames to `slots`; at most `latest_slots` of them for frames of mode `latest`.
 
     A caller that has used more than another active one may hold `per_caller` slots: a frame is never interrupted, so
-    costly ones must not occupy every processor. The frames of one caller are admitted in their order, except that one of mode
-    `latest` that may not take a free slot keeps its position. `clock` returns monotonic seconds. Belongs to one event
-    loop.
+    costly ones must not occupy every processor. The frames of one caller are admitted in their order, except that one
+    of mode `latest` that may not take a free slot keeps its position. `clock` returns monotonic seconds. Belongs to one
+    event loop.
     """
 
     def __init__(
