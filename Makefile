@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: bench soak evaluate ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack bench soak evaluate ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -69,6 +69,10 @@ ablation: $(DEV_READY)
 # Compares with LitServe, too, if it is installed: .venv/bin/pip install -e '.[bench-litserve]'
 bench: $(DEV_READY)
 	PYTHONPATH=tools $(BIN)/python -m bench $(ARGS)
+
+# Attacks services that it starts on 127.0.0.1, and prints what normal cameras felt. Needs redis-server and faketime.
+attack: $(DEV_READY)
+	PYTHONPATH=tools $(BIN)/python -m attack $(ARGS)
 
 asyncapi: $(DEV_READY)
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml

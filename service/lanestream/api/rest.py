@@ -14,7 +14,6 @@ from pydantic import BaseModel
 from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
 from lanestream.api.service import Service
-from lanestream.asyncapi import document
 from lanestream.errors import NotAcceptableError, one_line
 from lanestream.images.decoding import decode
 from lanestream.logs import dropped_records
@@ -25,7 +24,6 @@ from lanestream.protocol import (
     DetectorName,
     FieldOfView,
     LanesMessage,
-    json_schemas,
     parse_camera,
 )
 from lanestream.streaming.session_registry import Caller
@@ -203,16 +201,16 @@ async def models(request: Request) -> ModelList:
     return ModelList(models=entries)
 
 
-@public_router.get("/v1/schema")
-async def schema() -> dict[str, dict[str, Any]]:
+@public_router.get("/v1/schema", response_model=dict[str, dict[str, Any]])
+async def schema(request: Request) -> Response:
     """Returns the JSON Schemas of the messages of `/v1/stream`, by the side that sends them."""
-    return json_schemas()
+    return Response(_service(request).schemas, media_type=_JSON)
 
 
-@public_router.get("/v1/asyncapi.json")
-async def asyncapi() -> dict[str, Any]:
+@public_router.get("/v1/asyncapi.json", response_model=dict[str, Any])
+async def asyncapi(request: Request) -> Response:
     """Returns the contract of `/v1/stream` as an AsyncAPI 3.0 document."""
-    return document()
+    return Response(_service(request).asyncapi, media_type=_JSON)
 
 
 @public_router.get("/healthz", responses={503: _PROBLEMS[503]})

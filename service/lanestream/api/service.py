@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -15,8 +16,9 @@ from lanestream.api.byte_budget import ByteBudget
 from lanestream.api.connections import ConnectionLimits, ConnectionTable, connection_of
 from lanestream.api.metrics import Metrics
 from lanestream.api.request_body import BodyLimits, BodyReader
+from lanestream.asyncapi import document
 from lanestream.errors import DrainingError, NotReadyError
-from lanestream.protocol import Limits
+from lanestream.protocol import Limits, json_schemas
 from lanestream.streaming.session_registry import SessionRegistry
 from lanestream.streaming.stores import open_store
 
@@ -68,6 +70,9 @@ class Service:
             BodyLimits(settings.max_bytes, settings.body_s, settings.max_sessions, settings.sessions_per_caller),
             self.budget,
         )
+        # Made once, since anyone may ask for them at any rate, and making them takes milliseconds.
+        self.schemas = json.dumps(json_schemas())
+        self.asyncapi = json.dumps(document())
         self.streams: set[OpenStream] = set()
         self.draining = False
         self._requests = 0
