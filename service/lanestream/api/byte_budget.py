@@ -55,3 +55,7 @@ class Charge:
         if size != self._size:
             self._budget.resize(self.caller, self._size, size)
             self._size = size
+
+    def shrink(self, amount: int) -> None:
+        """Gives a part back, at most what is charged."""
+        self.set(max(0, self._size - amount))

@@ -87,7 +87,7 @@ class StreamConnection:
         self._received = asyncio.Event()
         self._wake_watcher = asyncio.Event()
         self._evicted = False
-        self._close_counted = False
+        self._closed = self._close_counted = False
         self._worker_losses = 0
         self._answered_at_loss = 0
         self._connection = connection_of(socket.scope)
@@ -129,7 +129,7 @@ class StreamConnection:
         """Receives messages until the client disconnects or an error ends the stream."""
         while (message := await self._socket.receive())["type"] != "websocket.disconnect":
             try:
-                await self._receive(message.get("text"), message.get("bytes"))
+                await self._receive(message.pop("text", None), message.pop("bytes", None))
             except (ProtocolError, NoDetectorError) as error:
                 await self._send(error_message(error))
             self._received.set()
@@ -167,7 +167,8 @@ class StreamConnection:
         try:
             self._charge.set(self._protocol.held_bytes + len(data))
         except BusyError as error:
-            return error
+            # Its traceback would keep the image.
+            return error.with_traceback(None)
         return None
 
     async def _start(self, message: StartMessage, now: float) -> None:
@@ -358,12 +359,16 @@ class StreamConnection:
             await self._send(message)
 
     async def _send(self, message: ServerMessage) -> None:
+        """Sends a message, unless this side has closed the socket: messages may still arrive then, which are errors."""
+        if self._closed:
+            return
         if isinstance(message, ErrorMessage):
             self._service.metrics.refused(message.code)
         await self._socket.send_text(message.model_dump_json())
 
     async def _close(self, code: int, reason: str = "") -> None:
         self._count_close(code)
+        self._closed = True
         await self._socket.close(code, reason)
 
     def _count_close(self, code: int) -> None:

@@ -2,7 +2,7 @@
 
 Frames are found in what the peer has sent before the library parses them, and passed on one by one. So the frames of
 one packet do not keep the event loop busy, a frame that is too large is refused by its header, and a peer that sends
-too fast is read more slowly, which slows it down.
+too fast, or more than there is memory for, is read more slowly, which slows it down.
 """
 
 from __future__ import annotations
@@ -156,8 +156,9 @@ class WebSocketConnection(_WebSocketProtocol):
     async def receive(self) -> ASGIReceiveEvent:
         """Returns the next event for the application."""
         message = await super().receive()
+        # From here on the application is charged.
+        self._charge.shrink(self._delivered_bytes)
         self._delivered_bytes = 0
-        self._charge.set(0)
         self._pass_on_soon()
         return message
 
@@ -175,12 +176,15 @@ class WebSocketConnection(_WebSocketProtocol):
         self._pass_on()
 
     def _pass_on(self) -> None:
-        """Passes complete frames to the library, as long as the application, the peer and its rate allow it."""
+        """Passes complete frames to the library, as long as the application, the peer and its limits allow it."""
+        if not self.handshake_complete:
+            self._connection.hold_reading(True)
+            return
         for _ in range(_FRAMES_AT_ONCE):
             header = read_frame_header(self._unread)
-            if header is None or not self._may_pass_on() or not self._is_acceptable(header):
+            if header is None or not self._is_acceptable(header) or not self._has_room(header):
                 break
-            if len(self._unread) < header.size or not self._spend(header):
+            if len(self._unread) < header.size or not self._may_pass_on() or not self._spend(header):
                 break
             frame = bytes(self._unread[: header.size])
             del self._unread[: header.size]
@@ -190,13 +194,12 @@ class WebSocketConnection(_WebSocketProtocol):
             self._pass_on_soon()
         if not self.transport.is_closing():
             header = read_frame_header(self._unread)
-            waiting = header is not None and len(self._unread) >= header.size
-            self._connection.hold_reading(not self._update_charge() or waiting)
+            waits = header is not None and len(self._unread) >= header.size
+            self._connection.hold_reading(waits or self._full_since is not None)
 
     def _may_pass_on(self) -> bool:
         """Returns whether the application waits for a message, and the peer has read what it was sent."""
-        ready = self.handshake_complete and not self.transport.is_closing()
-        return ready and not self.read_paused and self.writable.is_set()
+        return not self.read_paused and self.writable.is_set() and not self.transport.is_closing()
 
     def _is_acceptable(self, header: FrameHeader) -> bool:
         """Refuses a frame by its header. Returns whether it may be waited for."""
@@ -235,23 +238,24 @@ class WebSocketConnection(_WebSocketProtocol):
             if header.final:
                 self._delivered_bytes, self._message_bytes = self._message_bytes, 0
 
-    def _update_charge(self) -> bool:
-        """Charges the caller for what is kept of its messages. Returns whether there is room for more of them.
+    def _has_room(self, header: FrameHeader) -> bool:
+        """Reserves memory for a whole frame, so that what has begun can end. Without room the peer has to wait.
 
-        Without room the peer has to wait, and after the time limit the stream is ended.
+        After the time limit the stream is ended.
         """
         account, now = self._connection.account, self.loop.time()
         if self._charge.caller != account:
             self._charge.set(0)
             self._charge = self._connection.table.budget.charge(account)
-        kept = len(self._unread) + self._message_bytes + self._delivered_bytes
+        kept = header.size + self._message_bytes + self._delivered_bytes
         try:
             self._charge.set(kept if kept > _FREE_BYTES else 0)
         except BusyError as error:
             self._full_since = self._full_since or now
             if now - self._full_since > self._connection.table.limits.send_s:
                 self._connection.table.report("memory", self._connection.address)
-                self.conn.send_text(error_message(error, fatal=True).model_dump_json().encode())
+                if not self.close_sent:
+                    self.conn.send_text(error_message(error, fatal=True).model_dump_json().encode())
                 self._fail(wire_status(error).close_code, error.message)
             elif self._timer is None:
                 self._timer = self.loop.call_later(_RETRY_S, self._continue)

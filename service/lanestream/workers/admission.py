@@ -20,6 +20,8 @@ _ACTIVE_S: Final = 1.0
 # The weight of a frame's cost in the mean by which the next one is estimated, and the estimate for a new caller.
 _GAIN: Final = 0.25
 _FIRST_COST_S: Final = 0.02
+# What every frame costs besides: receiving it, handing it over and answering, even if its image is refused.
+_OVERHEAD_S: Final = 0.002
 
 
 @dataclass(eq=False)
@@ -27,7 +29,7 @@ class Slot:
     """A frame's permission to be processed; what it is expected to cost, and has cost, in seconds of processor time."""
 
     expected_s: float = _FIRST_COST_S
-    cost_s: float = 0.0
+    cost_s: float = _OVERHEAD_S
 
     def charge(self, seconds: float) -> None:
         """Adds processor time to the caller's account."""

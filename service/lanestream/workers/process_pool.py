@@ -32,7 +32,7 @@ _MOST_PROCESSES: Final = 8
 _WORKER_BYTES: Final = 400e6
 _SERVICE_BYTES: Final = 300e6
 # A frame takes a fraction of a second. A worker that takes longer than this hangs.
-_FRAME_S: Final = 5.0
+_FRAME_S: Final = 4.0
 # Loading takes seconds, but TensorRT may build engines for minutes.
 _START_S: Final = 300.0
 

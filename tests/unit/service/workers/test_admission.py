@@ -34,7 +34,7 @@ class Frames:
         await asyncio.sleep(0)
 
     async def leave(self, name: str, cost_s: float = 0.0) -> None:
-        self.holders[name].charge(cost_s)
+        self.holders[name].cost_s = cost_s
         self._leaving[name].set()
         await self.tasks[name]
         await asyncio.sleep(0)
