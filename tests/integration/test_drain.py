@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import signal
+import subprocess
+import sys
 import threading
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -159,3 +161,15 @@ def test_clients_that_never_read_do_not_delay_the_stop() -> None:
             silent.sendall(2000 * frame(PING, bytes(125)))
         process.send_signal(signal.SIGTERM)
         assert process.wait(fakes.WAIT_S) in (0, -signal.SIGTERM)
+
+
+def test_a_service_that_still_loads_its_networks_stops_at_once() -> None:
+    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        log = next(line for line in process.stderr if "loading the networks" in line)
+        process.send_signal(signal.SIGTERM)
+        log += process.stderr.read()
+        assert process.wait(fakes.WAIT_S) == -signal.SIGTERM
+        assert ": ready" not in log
+        assert "Traceback" not in log

@@ -155,8 +155,14 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
     host, port = listener.getsockname()[:2]
     warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
     _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
+    starting = asyncio.create_task(_start_pool(app.state.service, load))
+    await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
+    if not starting.done():  # a signal came first
+        starting.cancel()
+        await asyncio.wait([starting])
+        return
     try:
-        pool = await _start_pool(app.state.service, load)
+        pool = starting.result()
         app.state.service.install(pool)
         for info in pool.capabilities.detectors:
             network = info.model

@@ -8,6 +8,7 @@ too fast, or more than there is memory for, is read more slowly, which slows it 
 from __future__ import annotations
 
 import asyncio
+import time
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
@@ -111,6 +112,7 @@ class WebSocketConnection(_WebSocketProtocol):
         super().connection_lost(exc)
         self._connection.lost()
         self._unread.clear()
+        self.frames.clear()
         self._charge.set(0)
         self._cancel_timer()
 
@@ -219,7 +221,7 @@ class WebSocketConnection(_WebSocketProtocol):
 
     def _spend(self, header: FrameHeader) -> bool:
         """Takes the tokens for a frame. If they are missing, returns False and continues when they are there."""
-        now, cost = self.loop.time(), _MESSAGE_COST if header.is_data and header.final else 1.0
+        now, cost = time.monotonic(), _MESSAGE_COST if header.is_data and header.final else 1.0
         buckets = self._bucket, self._connection.table.account_messages(self._connection.account)
         wait_s = max(bucket.seconds_until(cost, now) for bucket in buckets)
         if wait_s > 0.0:
@@ -243,7 +245,7 @@ class WebSocketConnection(_WebSocketProtocol):
 
         After the time limit the stream is ended.
         """
-        account, now = self._connection.account, self.loop.time()
+        account, now = self._connection.account, time.monotonic()
         if self._charge.caller != account:
             self._charge.set(0)
             self._charge = self._connection.table.budget.charge(account)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -33,8 +34,11 @@ _WORKER_BYTES: Final = 400e6
 _SERVICE_BYTES: Final = 300e6
 # A frame takes a fraction of a second. A worker that takes longer than this hangs.
 _FRAME_S: Final = 4.0
-# Loading takes seconds, but TensorRT may build engines for minutes.
-_START_S: Final = 300.0
+# Loading takes seconds, but TensorRT may build engines for minutes. A worker that replaces another one gets this long
+# in any case, and besides a multiple of what the first one took.
+_START_S: Final = 600.0
+_LEAST_START_S: Final = 20.0
+_START_FACTOR: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,9 @@ class ProcessPool(WorkerPool):
         memory. Networks on a GPU get one process, in which the requests of all cameras meet. Raises the errors of
         `setup.load`, and WorkerLostError if a worker ends before it is ready or is not ready after `start_s` seconds.
         """
+        began = time.monotonic()
         workers = [await Worker.start(setup, start_s)]
+        usual_s = time.monotonic() - began
         try:
             processes = processes or default_processes(workers[0].capabilities)
             async with asyncio.TaskGroup() as starting:
@@ -136,7 +142,8 @@ class ProcessPool(WorkerPool):
                 await worker.kill()
             raise error.exceptions[0] if isinstance(error, ExceptionGroup) else error from None
         threads = threads_of(processes) if threads_of is not None else 1
-        return cls(setup, workers, threads, observe, frame_s, start_s, restarts, observe_worker)
+        restart_s = min(start_s, _LEAST_START_S + _START_FACTOR * usual_s)
+        return cls(setup, workers, threads, observe, frame_s, restart_s, restarts, observe_worker)
 
     @property
     def works(self) -> bool:
