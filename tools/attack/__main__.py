@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import asdict
 from pathlib import Path
 
@@ -49,6 +50,9 @@ def main(only: tuple[str, ...], short: bool, rest: float | None, path: Path, lis
         raise click.UsageError(str(error)) from None
     path.parent.mkdir(parents=True, exist_ok=True)
     raise_file_limit()
+    # Whoever started this in the background may have made it ignore the signals by which services are stopped.
+    for number in (signal.SIGHUP, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
     pace = Pace(short, rest if rest is not None else _SHORT_REST_S if short else _REST_S)
     runner = Runner(load_clips((LARGE,), _FRAMES)[LARGE], path.parent, pace)
     outcomes = []

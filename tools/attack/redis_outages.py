@@ -71,19 +71,18 @@ async def _black_hole(redis: Redis) -> None:
 
 async def _resume_after(outage: Callable[[Redis], Awaitable[None]], target: Target, stop_at: float, count: int) -> None:
     """Opens `count` sessions, closes their sockets, and resumes all of them after, or during, the outage."""
-    redis = Redis.from_url(target.setting("redis_url"))
     try:
         while time.monotonic() < stop_at:
             tokens = await asyncio.gather(*(_open(target) for _ in range(count)))
-            await outage(redis)
+            # A connection of its own each time: Redis closes idle ones.
+            async with Redis.from_url(target.setting("redis_url")) as redis:
+                await outage(redis)
             async with asyncio.timeout(_RESUMED_WITHIN_S):
                 resumed = await asyncio.gather(*(_resume(target, token) for token in tokens))
             if not all(resumed):
                 raise UnexpectedError(f"{resumed.count(False)} of {count} sessions were not resumed")
     except TimeoutError:
         raise UnexpectedError(f"sessions were neither resumed nor lost within {_RESUMED_WITHIN_S:g} s") from None
-    finally:
-        await redis.aclose()
 
 
 async def _open(target: Target) -> str:

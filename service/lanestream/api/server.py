@@ -49,8 +49,6 @@ _OTHER_FILES: Final = 128
 _CLOSE_S: Final = 0.5
 # What shells add to the number of the signal by which a process ended.
 _SIGNALED: Final = 128
-# All of them begin a drain. A terminal that is closed sends SIGHUP.
-_STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None = None) -> None:
@@ -129,9 +127,11 @@ class LanestreamServer(uvicorn.Server):
             received.append(number)
             self.should_exit = True
 
-        in_main = threading.current_thread() is threading.main_thread()
-        # A process that was started to ignore SIGHUP, by nohup, goes on.
-        handled = [each for each in _STOP_SIGNALS if in_main and signal.getsignal(each) is not signal.SIG_IGN]
+        handled: list[signal.Signals] = []
+        if threading.current_thread() is threading.main_thread():
+            handled += [signal.SIGINT, signal.SIGTERM]
+            # A terminal that is closed sends it. A process that was started to ignore it, by nohup, goes on.
+            handled += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else []
         before = {number: signal.signal(number, stop) for number in handled}
         try:
             yield
