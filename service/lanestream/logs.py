@@ -31,6 +31,7 @@ _LIBRARY_FIELDS: Final = ("color_message", "websocket")
 # uvicorn's access log. The arguments of its records are the address, method, path, HTTP version and status.
 _ACCESS: Final = "uvicorn.access"
 _ACCESS_ARGUMENTS: Final = 5
+_MOST_PATH_CHARS: Final = 200
 _PROBES: Final = frozenset({"/healthz", "/readyz", "/metrics"})
 # About 8,000 lines. A limit in bytes, because callers determine the length of some lines.
 _QUEUE_BYTES: Final = 1 << 20
@@ -159,7 +160,7 @@ class JsonLogFormatter(JsonFormatter):
 
 
 class QueryRemover(logging.Filter):
-    """Removes the query string from every path in a record, because it might contain secrets."""
+    """Removes the query string, which might contain secrets, from every path in a record, and cuts long paths."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Changes the record in place, and always keeps it."""
@@ -255,4 +256,5 @@ def _write(descriptor: int, data: bytes) -> None:
 
 
 def _remove_query(value: object) -> object:
-    return value.partition("?")[0] if isinstance(value, str) and value.startswith("/") else value
+    """Returns a path without its query, cut where a stranger would only fill the log; anything else unchanged."""
+    return value.partition("?")[0][:_MOST_PATH_CHARS] if isinstance(value, str) and value.startswith("/") else value
