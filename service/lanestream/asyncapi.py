@@ -21,7 +21,7 @@ _SERVER: Final[tuple[type[Message], ...]] = get_args(ServerMessage)
 # Close codes that do not follow an error; the others belong to the code of an error.
 _CLOSE_CODES: Final[dict[int, str]] = {
     1000: "after `summary`",
-    1009: "a message is larger than twice the size limit of an image",
+    1009: "a message is larger than twice the size limit of an image, or a text larger than 64 KB",
     1012: "after `draining`, once every frame that arrived before it was answered",
 }
 
