@@ -113,7 +113,9 @@ class ConnectionTable:
     def fit(self, most: int) -> None:
         """Lowers the limits to `most` connections, for example because the system allows few open files."""
         if most < self.limits.connections:
-            _log.warning("only %d of %d connections are possible: raise nofile", most, self.limits.connections)
+            _log.warning(
+                "only %d of %d connections are possible: raise the limit of open files", most, self.limits.connections
+            )
             fewer = self.limits.connections - most
             self.limits = replace(
                 self.limits,
@@ -227,8 +229,8 @@ class ConnectionTable:
             return self._evict(address, "address_limit")
         without_session = len(self) - len(self._with_session)
         if len(self) >= limits.connections or without_session >= limits.without_session:
-            crowded = max(self._evictable, key=lambda each: len(self._evictable[each]), default=address)
-            return self._evict(crowded, "limit")
+            busiest = max(self._evictable, key=lambda each: len(self._evictable[each]), default=address)
+            return self._evict(busiest, "limit")
         return True
 
     def _evict(self, address: str, reason: CutReason) -> bool:

@@ -62,9 +62,9 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None
     # Images and messages of a few megabytes come and go, and must not add up.
     keep_freed_memory(_LARGEST_KEPT_BYTES)
     app = create_app(None, settings, draw)
-    app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     listener = listen(settings.host, settings.port)
     server = LanestreamServer(app, settings)
+    app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     with server.stopping_on_signals(), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
         runner.run(_serve(server, listener, app, load))
 

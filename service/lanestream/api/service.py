@@ -36,7 +36,7 @@ DrawLanes = Callable[["Image", "LanesMessage"], "Image"]
 _DRAIN_POLL_S: Final = 0.02
 # An idle connection is kept for this long between two requests.
 _KEEP_ALIVE_S: Final = 5.0
-# Room for what is no frame nor its announcement: `start`, `end` and pongs.
+# Room for messages besides frames: `start`, `end` and pongs.
 _CONTROL_MESSAGES_PER_S: Final = 20.0
 # uvicorn's variable: the proxies whose X-Forwarded-For headers are trusted.
 _PROXIES_VARIABLE: Final = "FORWARDED_ALLOW_IPS"

@@ -82,7 +82,7 @@ _ADAPTER: Final[TypeAdapter[ModelInfo]] = TypeAdapter(Annotated[ModelInfo, Field
 
 
 def require_file(path: Path) -> None:
-    """Raises ModelError if there is no file at `path`, or if it can't be read."""
+    """Raises ModelError if the file at `path` is missing or can't be read."""
     hint = "give the path of an exported .onnx file"
     try:
         if not path.is_file():

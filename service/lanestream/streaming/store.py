@@ -123,7 +123,7 @@ class MemoryStore:
         self._keys_by_quota.clear()
 
     def owner(self, key: str) -> str | None:
-        """Returns the owner of the session; None if there is no such session."""
+        """Returns the owner of the session; None if the session is unknown."""
         session = self._get(key)
         return None if session is None else session.owner
 
