@@ -177,15 +177,15 @@ UNLIMITED = {"max_sessions": 4 * RACES, "max_sessions_per_caller": 4 * RACES}
 async def race(urls: Sequence[str], token: str) -> None:
     """Resumes a session over a socket of each URL at the same instant; exactly one of them must keep it."""
     async with connect(f"{urls[0]}/v1/stream") as one, connect(f"{urls[1]}/v1/stream") as other:
-        told = [asyncio.create_task(evicted_or_answered(socket)) for socket in (one, other)]
+        outcomes = [asyncio.create_task(evicted_or_answered(socket)) for socket in (one, other)]
         for socket in (one, other):
             await socket.send(json.dumps({"type": "start", "mode": "all", "resume_token": token}))
-        await asyncio.wait(told, timeout=fakes.WAIT_S, return_when=asyncio.FIRST_COMPLETED)
-        assert [task.result() for task in told if task.done()] == ["evicted"], "one of them was told"
-        winner = one if told[1].done() else other
+        await asyncio.wait(outcomes, timeout=fakes.WAIT_S, return_when=asyncio.FIRST_COMPLETED)
+        assert [task.result() for task in outcomes if task.done()] == ["evicted"], "one of them was evicted"
+        winner = one if outcomes[1].done() else other
         await winner.send(fakes.image_file())
         async with asyncio.timeout(fakes.WAIT_S):
-            assert sorted(await asyncio.gather(*told)) == ["evicted", "lanes"]
+            assert sorted(await asyncio.gather(*outcomes)) == ["evicted", "lanes"]
 
 
 async def evicted_or_answered(socket: AsyncConnection) -> str:

@@ -184,7 +184,7 @@ async def close(registry: SessionRegistry, session: OpenSession) -> OpenSession:
 
 
 def close_if_evicted(registry: SessionRegistry, session: OpenSession) -> asyncio.Event:
-    """Closes a session as its socket does when it is evicted. The event is set when it was told."""
+    """Closes a session as its socket does when it is evicted. The event is set when it is notified."""
     evicted, tasks = asyncio.Event(), []
 
     def on_evict() -> None:
@@ -196,7 +196,7 @@ def close_if_evicted(registry: SessionRegistry, session: OpenSession) -> asyncio
 
 
 async def race(registries: Sequence[SessionRegistry], token: str | None) -> OpenSession:
-    """Resumes a session from two sockets at the same instant. Returns it when the other socket was told `evicted`."""
+    """Resumes a session from two sockets at the same instant. Returns it when the other socket was evicted."""
 
     async def resume(registry: SessionRegistry) -> tuple[OpenSession | None, asyncio.Event]:
         try:
@@ -557,7 +557,7 @@ async def test_a_start_that_is_canceled_keeps_no_session() -> None:
     assert len(registry) == 0
 
 
-async def test_a_session_without_frames_is_told_that_another_replica_resumed_it() -> None:
+async def test_a_session_without_frames_notices_that_another_replica_resumed_it() -> None:
     async with replicas(2, SharedStore()) as (one, other):
         first = await start(one)
         evicted = asyncio.Event()
