@@ -300,7 +300,7 @@ def load_settings(**options: object) -> Settings:
         model_config = SettingsConfigDict(toml_file=path)
 
     try:
-        return Settings.model_construct(**dict(FileSettings(**given)))
+        settings = Settings.model_construct(**dict(FileSettings(**given)))
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         name = str(problem["loc"][0])
@@ -311,6 +311,13 @@ def load_settings(**options: object) -> Settings:
         else:
             label = _PREFIX + name.upper()
         raise _settings_error(label, problem) from None
+    least = 4 * settings.max_bytes
+    if settings.buffered_bytes < least:
+        raise SettingsError(
+            f"max_buffered_bytes = {settings.buffered_bytes}: a caller's quarter can't hold one image of max_bytes",
+            f"use at least {least}, or lower max_bytes",
+        )
+    return settings
 
 
 def to_toml(settings: Settings) -> str:

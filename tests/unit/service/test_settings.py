@@ -218,3 +218,9 @@ def _row(name: str) -> str:
 
 def _shown(default: object) -> str:
     return "" if default in (None, ()) else f"{default:.12g}" if isinstance(default, int | float) else str(default)
+
+
+def test_the_memory_for_images_must_hold_an_image_of_each_caller() -> None:
+    assert load_settings(max_buffered_bytes=4 << 20, max_bytes=1 << 20).buffered_bytes == 4 << 20
+    with pytest.raises(SettingsError, match=r"max_buffered_bytes = 4194303: .*use at least 4194304"):
+        load_settings(max_buffered_bytes=(4 << 20) - 1, max_bytes=1 << 20)
