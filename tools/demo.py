@@ -28,7 +28,7 @@ def main(video: str | None) -> int:
     if video is None:
         video = str(OUT / "scene.mp4")
         print(f"rendering {video}", flush=True)
-        code = subprocess.run([LANESTREAM, "scene", video, "--lane-change"], check=False).returncode
+        code = subprocess.run([LANESTREAM, "scene", video, "--kind", "lane_change"], check=False).returncode
         if code:
             return code
     name = Path(video).stem

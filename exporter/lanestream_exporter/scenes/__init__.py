@@ -3,7 +3,7 @@
 A scene is one frozen value: `scene.py` samples it at random and `render.py` turns it into pixels and labels. Everything
 on the ground is a function of road coordinates: s meters along the road and u meters to the left of its reference line.
 `projection.py` maps every pixel to (s, u) once per frame, so that paint, wear and shadows move with the road. Labels
-come from the inverse of the same mapping.
+come from the inverse of the same mapping. `tracking_clips.py` samples clips for measuring trackers.
 """
 
 from lanestream_exporter.scenes.clip import Clip, Drive, render_clip, sample_clip, write_clip

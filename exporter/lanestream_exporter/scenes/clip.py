@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from av.video.stream import VideoStream
 
 from lanestream_exporter.scenes.lens import Lens
 from lanestream_exporter.scenes.light import Atmosphere
+from lanestream_exporter.scenes.motion import LANE_CHANGE_TIME, SidewaysMove, VehicleMotion
 from lanestream_exporter.scenes.projection import REACH
 from lanestream_exporter.scenes.random_sampler import RandomSampler
 from lanestream_exporter.scenes.render import RenderedFrame, render_still
@@ -24,13 +25,14 @@ from lanestream_exporter.scenes.scene import STYLES, Weather, compose_scene, sam
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from lanestream.road.view import Image
     from lanestream_exporter.datasets.labels import LabeledFrame
     from lanestream_exporter.scenes.layout import RoadStyle
     from lanestream_exporter.scenes.scene import Scene
     from lanestream_exporter.scenes.traffic import Vehicle
 
 ENCODERS = ("libx264", "libopenh264", "mpeg4")  # by preference; not every build of FFmpeg has all of them
-ProgressCallback = Callable[[int, int], None]  # (frames done, total frames)
+ProgressCallback = Callable[[int], None]  # called with the number of frames done
 
 SPEEDS: dict[RoadStyle, tuple[float, float]] = {  # meters per second
     "highway": (22.0, 31.0),
@@ -38,47 +40,8 @@ SPEEDS: dict[RoadStyle, tuple[float, float]] = {  # meters per second
     "street": (7.0, 13.0),
     "lane": (7.0, 13.0),
 }
-LANE_CHANGE_TIME = 4.0  # duration of a lane change, seconds
 FAIR_CLOUDS = 0.35  # largest share of the sky on a fair day
 MIN_GAP = 6.0  # meters between our vehicle and others
-
-
-@dataclass(frozen=True)
-class LaneChangeManeuver:
-    """A smooth move to another lane."""
-
-    start: float  # seconds
-    shift: float  # meters to the left
-
-    def shift_at(self, time: float) -> float:
-        """Returns the shift to the left at `time` seconds, meters; it starts and ends at zero lateral speed."""
-        share = min(1.0, max(0.0, (time - self.start) / LANE_CHANGE_TIME))
-        return self.shift * share**3 * (10.0 + share * (6.0 * share - 15.0))
-
-
-@dataclass(frozen=True)
-class VehicleMotion:
-    """The motion of our vehicle along the road."""
-
-    speed: float  # meters per second
-    sway: float  # amplitude of the lateral sway, meters
-    sway_period: float  # seconds
-    bounce: float  # amplitude of the pitch, radians
-    change: LaneChangeManeuver | None = None
-
-    def lateral(self, time: float) -> float:
-        """Returns the distance to the left of the starting position at `time` seconds, meters."""
-        sway = self.sway * math.sin(math.tau * time / self.sway_period)
-        return sway + (self.change.shift_at(time) if self.change else 0.0)
-
-    def heading(self, time: float) -> float:
-        """Returns the direction of travel relative to the road, radians to the left."""
-        step = 0.01
-        return math.atan2(self.lateral(time + step) - self.lateral(time - step), 2.0 * step * self.speed)
-
-    def pitch(self, time: float) -> float:
-        """Returns the pitch in radians, the sum of two oscillations of a car's suspension."""
-        return self.bounce * (0.65 * math.sin(math.tau * 1.3 * time) + 0.35 * math.sin(math.tau * 2.9 * time + 1.0))
 
 
 @dataclass(frozen=True)
@@ -134,22 +97,21 @@ def sample_clip(
     # The video encoder already compresses the frames.
     scene = replace(scene, lens=replace(scene.lens, quality=0))
     if drive.lane_change:
-        motion = replace(motion, change=_lane_change(sampler, scene, duration))
+        motion = replace(motion, moves=_lane_change(sampler, scene, duration))
     clip = Clip(scene, motion, frames, fps)
-    return replace(clip, scene=replace(scene, traffic=_without_collisions(clip)))
+    return replace(clip, scene=replace(scene, traffic=without_collisions(clip)))
 
 
-def _lane_change(sampler: RandomSampler, scene: Scene, duration: float) -> LaneChangeManeuver | None:
-    """Samples a change to an adjacent lane in our direction, mid-clip; None if there is no such lane."""
+def _lane_change(sampler: RandomSampler, scene: Scene, duration: float) -> tuple[SidewaysMove, ...]:
+    """Samples a change to an adjacent lane in our direction, mid-clip; nothing if there is no such lane."""
     shifts = [lane for lane in scene.road.lanes if 1.0 < abs(lane - scene.pose.u) < 4.5]
     if not shifts:
-        return None
-    return LaneChangeManeuver(
-        max(0.0, (duration - LANE_CHANGE_TIME) * sampler.uniform(0.35, 0.65)), sampler.choice(shifts) - scene.pose.u
-    )
+        return ()
+    start = max(0.0, (duration - LANE_CHANGE_TIME) * sampler.uniform(0.35, 0.65))
+    return (SidewaysMove(start, sampler.choice(shifts) - scene.pose.u),)
 
 
-def _without_collisions(clip: Clip) -> tuple[Vehicle, ...]:
+def without_collisions(clip: Clip) -> tuple[Vehicle, ...]:
     """Returns the traffic without the vehicles that ours would collide with."""
     times = np.arange(0.0, clip.frames / clip.fps + 0.2, 0.2)
     lateral = clip.scene.pose.u + np.array([clip.motion.lateral(float(time)) for time in times])
@@ -172,22 +134,39 @@ def render_clip(clip: Clip) -> Iterator[RenderedFrame]:
 def write_clip(clip: Clip, video: Path, labels: Path, progress: ProgressCallback | None = None) -> None:
     """Renders `clip` into an MP4 file at `video` and writes the labels of every frame to `labels`.
 
-    Raises ValueError if the width or height is odd, because 4:2:0 video halves both for color.
+    `progress` is called with the number of frames done. Raises ValueError if the width or height is odd, because 4:2:0
+    video halves both for color.
     """
-    camera = clip.scene.camera
-    if camera.width % 2 or camera.height % 2:
-        raise ValueError(f"a video needs an even width and height, got {camera.width}x{camera.height}")
+    frames = (
+        (frame.image, label_record(frame.labels, video.name, number)) for number, frame in enumerate(render_clip(clip))
+    )
+    write_frames(frames, clip.fps, video, labels, progress)
+
+
+def write_frames(
+    frames: Iterable[tuple[Image, dict[str, Any]]],
+    fps: float,
+    video: Path,
+    labels: Path,
+    progress: ProgressCallback | None = None,
+) -> None:
+    """Writes images (H, W, 3) into an MP4 file at `video`, and the record of each as a line of JSON to `labels`.
+
+    `progress` is called with the number of frames done. Raises ValueError if the width or height is odd.
+    """
+    stream = None
     with av.open(str(video), "w", format="mp4") as container, labels.open("w", encoding="utf-8") as lines:
-        stream = _add_stream(container, clip)
-        for number, frame in enumerate(render_clip(clip)):
-            video_frame = av.VideoFrame.from_ndarray(frame.image, format="bgr24")
+        for number, (image, record) in enumerate(frames):
+            stream = stream or _add_stream(container, image, fps)
+            video_frame = av.VideoFrame.from_ndarray(image, format="bgr24")
             video_frame.pts = number
-            video_frame.time_base = Fraction(1) / _rate(clip.fps)
+            video_frame.time_base = Fraction(1) / _rate(fps)
             container.mux(stream.encode(video_frame))
-            lines.write(json.dumps(label_record(frame.labels, video.name, number)) + "\n")
+            lines.write(json.dumps(record) + "\n")
             if progress:
-                progress(number + 1, clip.frames)
-        container.mux(stream.encode(None))
+                progress(number + 1)
+        if stream:
+            container.mux(stream.encode(None))
 
 
 def label_record(labels: LabeledFrame, clip: str, frame: int) -> dict[str, Any]:
@@ -210,17 +189,20 @@ def label_record(labels: LabeledFrame, clip: str, frame: int) -> dict[str, Any]:
     }
 
 
-def _add_stream(container: av.container.OutputContainer, clip: Clip) -> VideoStream:
+def _add_stream(container: av.container.OutputContainer, image: Image, fps: float) -> VideoStream:
+    height, width = image.shape[:2]
+    if width % 2 or height % 2:
+        raise ValueError(f"a video needs an even width and height, got {width}x{height}")
     encoder = next(name for name in ENCODERS if name in av.codecs_available)
-    stream = container.add_stream(encoder, rate=_rate(clip.fps))
+    stream = container.add_stream(encoder, rate=_rate(fps))
     if not isinstance(stream, VideoStream):
         raise TypeError(f"{encoder} created a {type(stream).__name__} instead of a video stream")
-    stream.width, stream.height = clip.scene.camera.width, clip.scene.camera.height
+    stream.width, stream.height = width, height
     stream.pix_fmt = "yuv420p"
     if encoder == "libx264":
         stream.options = {"crf": "18", "preset": "veryfast"}
     else:
-        stream.bit_rate = round(0.2 * stream.width * stream.height * clip.fps)
+        stream.bit_rate = round(0.2 * width * height * fps)
     return stream
 
 

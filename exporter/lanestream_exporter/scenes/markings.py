@@ -13,7 +13,7 @@ from lanestream_exporter.scenes.noise import noise_tiles, sample_noise
 from lanestream_exporter.scenes.projection import Float32Array, GroundBand, GroundGrid, coverage, pulse
 
 if TYPE_CHECKING:
-    from lanestream_exporter.scenes.road import Marking, Road
+    from lanestream_exporter.scenes.road import Boundary, Marking, Road
     from lanestream_exporter.scenes.surface import Color
 
 DOT_RISE = 0.02  # height of a dot above the road, meters
@@ -81,7 +81,7 @@ def paint_boundaries(grid: GroundGrid, road: Road, ground: Float32Array) -> None
     """Paints every marked boundary onto the unlit ground, in place."""
     for boundary in road.boundaries:
         if boundary.marking:
-            band = _around(grid, boundary.u, boundary.marking)
+            band = _around(grid, boundary, boundary.marking)
             _blend(ground, band, marking_coverage(band, boundary.u, boundary.marking), paint_color(boundary.marking))
 
 
@@ -122,10 +122,19 @@ def marking_coverage(band: GroundBand, u: float, marking: Marking) -> Float32Arr
     return cover * _paint_left(band, marking.wear, marking.seed)
 
 
-def _around(grid: GroundGrid, u: float, marking: Marking) -> GroundBand:
-    """Returns the pixels that a marking may touch: its stripes plus a margin for the footprint of far pixels."""
-    reach = 1.5 * marking.width + marking.gap + 0.1
-    return grid.band(u - reach, u + reach)
+def _around(grid: GroundGrid, boundary: Boundary, marking: Marking) -> GroundBand:
+    """Returns the pixels that a marking may touch: its stripes plus a margin for the footprint of far pixels.
+
+    A taper is undone: the u of the pixels is as if the boundary were straight.
+    """
+    reach, u, taper = 1.5 * marking.width + marking.gap + 0.1, boundary.u, boundary.taper
+    if taper:
+        band = grid.band(u + min(0.0, taper.shift) - reach, u + max(0.0, taper.shift) + reach)
+        band = replace(band, u=band.u - taper.shift_at(band.s.astype(np.float64)).astype(np.float32))
+    else:
+        band = grid.band(u - reach, u + reach)
+    limited = math.isfinite(boundary.first) or math.isfinite(boundary.last)
+    return band.within(boundary.first, boundary.last) if limited else band
 
 
 def _dots(band: GroundBand, offset: Float32Array, s: Float32Array, marking: Marking) -> Float32Array:

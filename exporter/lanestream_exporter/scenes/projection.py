@@ -146,11 +146,17 @@ class RoadProjection:
         ground = self.vertical_curvature * x**2 / 2.0
         return np.stack([self.camera.columns(x, y), self.camera.rows(x, z + ground)], axis=-1)
 
-    def boundary_columns(self, rows: FloatArray, u: float) -> FloatArray:
+    def boundary_columns(self, rows: FloatArray, u: float | FloatArray) -> FloatArray:
         """Returns the image columns of the line u = constant at the rows: the exact inverse of `GroundGrid.u`."""
         x = self.camera.road_distance(rows, self.vertical_curvature)
         y, direction = (np.interp(x, self.x, values) for values in (self.y, self.direction))
         return self.camera.columns(x, y + u / np.cos(direction))
+
+    def road_positions(self, rows: FloatArray, u: float | FloatArray) -> FloatArray:
+        """Returns the road positions s of the line u = constant at the rows: the exact inverse of `GroundGrid.s`."""
+        x = self.camera.road_distance(rows, self.vertical_curvature)
+        s, direction = (np.interp(x, self.x, values) for values in (self.s, self.direction))
+        return np.asarray(s + u * np.tan(direction))
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from lanestream_exporter.scenes.traffic import Vehicle, draw_vehicle
 if TYPE_CHECKING:
     from lanestream.road.curve import FloatArray
     from lanestream.road.view import Image
+    from lanestream_exporter.scenes.road import Boundary
     from lanestream_exporter.scenes.scene import Scene
 
 
@@ -47,6 +48,13 @@ class RenderedFrame:
 
 def render_still(scene: Scene) -> RenderedFrame:
     """Renders one scene. The same scene always gives the same pixels."""
+    target = render_target(scene)
+    labels = annotate(scene, target.projection, target.hidden)
+    return RenderedFrame(develop(target.image, scene.lens), labels, scene.camera.horizon)
+
+
+def render_target(scene: Scene) -> RenderTarget:
+    """Draws everything in front of the lens."""
     camera = scene.camera
     projection = RoadProjection.from_pose(camera, scene.road.course, scene.pose)
     grid = GroundGrid.from_projection(projection)
@@ -57,8 +65,7 @@ def render_still(scene: Scene) -> RenderedFrame:
     _draw_objects(target, scene)
     if scene.wetness > 0.0:
         _reflect(target, grid, scene.wetness)
-    labels = annotate(scene, projection, target.hidden)
-    return RenderedFrame(develop(target.image, scene.lens), labels, camera.horizon)
+    return target
 
 
 def _draw_ground(target: RenderTarget, scene: Scene, grid: GroundGrid) -> None:
@@ -110,14 +117,17 @@ def _reflect(target: RenderTarget, grid: GroundGrid, wetness: float) -> None:
     region[...] = np.clip(region * (1.0 - 0.5 * fade) + smeared * fade, 0.0, 255.0).astype(np.uint8)
 
 
-def annotate(scene: Scene, projection: RoadProjection, hidden: Image) -> LabeledFrame:
-    """Returns the labels of a frame. `hidden` (H, W) is non-zero where walls, trees or houses hide the road."""
+def annotate(scene: Scene, projection: RoadProjection, hidden: Image, label_rows: int = LABEL_ROWS) -> LabeledFrame:
+    """Returns the labels of a frame, with points in about `label_rows` rows over the image height.
+
+    `hidden` (H, W) is non-zero where walls, trees or houses hide the road.
+    """
     camera = scene.camera
-    rows = _rows(scene, projection)
+    rows = _rows(scene, projection, label_rows)
     lanes = []
-    for lane_id, position in enumerate(scene.road.positions(scene.pose.u)):
+    for lane_id, position in enumerate(scene.road.positions(scene.pose.s, scene.pose.u)):
         boundary = scene.road.boundaries[lane_id]
-        points = _visible(scene, hidden, np.stack([projection.boundary_columns(rows, boundary.u), rows], axis=-1))
+        points = _visible(scene, hidden, _boundary_points(boundary, projection, rows))
         if len(points) < 3 or points[0, 1] - points[-1, 1] < MIN_LABEL_SPAN * camera.height:
             continue
         color = boundary.marking.color if boundary.marking else None
@@ -125,10 +135,20 @@ def annotate(scene: Scene, projection: RoadProjection, hidden: Image) -> Labeled
     return LabeledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, WHOLE)
 
 
-def _rows(scene: Scene, projection: RoadProjection) -> FloatArray:
+def _boundary_points(boundary: Boundary, projection: RoadProjection, rows: FloatArray) -> FloatArray:
+    """Returns the points (N, 2) of a boundary at those of the rows where it exists."""
+    u = boundary.u_at(rows * 0.0)
+    for _ in range(3):  # s depends on u, but hardly
+        s = projection.road_positions(rows, u)
+        u = boundary.u_at(s)
+    exists = (s >= boundary.first) & (s <= boundary.last)
+    return np.stack([projection.boundary_columns(rows, u), rows], axis=-1)[exists]
+
+
+def _rows(scene: Scene, projection: RoadProjection, label_rows: int) -> FloatArray:
     """Returns the image rows with label points, from the bottom up."""
     camera = scene.camera
-    step = max(1, camera.height // LABEL_ROWS)
+    step = max(1, camera.height // label_rows)
     rows = np.arange(camera.height - 1, -1, -step, dtype=np.float64)
     distance = camera.road_distance(rows, projection.vertical_curvature)
     max_distance = camera.focal * TYPICAL_LANE_WIDTH / (MIN_LANE_WIDTH * camera.width / 640.0)

@@ -68,11 +68,39 @@ class Marking:
 
 
 @dataclass(frozen=True)
+class Taper:
+    """A stretch of road on which a boundary moves to the side, because a lane ends or begins. Meters."""
+
+    start: float  # s
+    length: float
+    shift: float  # to the left, from its start to its end
+
+    def shift_at(self, s: FloatArray) -> FloatArray:
+        """Returns the shift to the left at the road positions s."""
+        share = np.clip((s - self.start) / self.length, 0.0, 1.0)
+        return np.asarray(self.shift * share**2 * (3.0 - 2.0 * share))
+
+
+@dataclass(frozen=True)
 class Boundary:
-    """A lane boundary at lateral position u in meters; without a marking it is the unmarked edge of the road."""
+    """A lane boundary at lateral position u in meters; without a marking it is the unmarked edge of the road.
+
+    It reaches from s = `first` to s = `last`; a `taper` moves it to the side.
+    """
 
     u: float
     marking: Marking | None
+    taper: Taper | None = None
+    first: float = -math.inf
+    last: float = math.inf
+
+    def u_at(self, s: FloatArray) -> FloatArray:
+        """Returns the lateral positions at the road positions s, in meters."""
+        return self.u + (self.taper.shift_at(s) if self.taper else np.zeros_like(s))
+
+    def reaches(self, s: float) -> bool:
+        """Returns whether the boundary exists at the road position s."""
+        return self.first <= s <= self.last
 
     @property
     def kind(self) -> str:
@@ -82,13 +110,24 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Road:
-    """A road: its course and its boundaries from left to right. The index of a boundary is its lane id."""
+    """A road: its course and its boundaries from left to right, none of which cross. Their index is their lane id."""
 
     course: Course
     boundaries: tuple[Boundary, ...]
     lanes: tuple[float, ...]  # centers of the lanes in our direction, u in meters
 
-    def positions(self, u: float) -> tuple[int, ...]:
-        """Returns the position of every boundary for a vehicle at lateral position u; -1 and +1 bound its lane."""
-        left = sum(boundary.u > u for boundary in self.boundaries)
-        return tuple(i - left if i < left else i - left + 1 for i in range(len(self.boundaries)))
+    def beside(self, s: float, u: float) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Returns the indices of the boundaries left and right of a vehicle at (s, u), the nearest first."""
+        here = [index for index, boundary in enumerate(self.boundaries) if boundary.reaches(s)]
+        left = [index for index in here if self.boundaries[index].u_at(np.array(s)) > u]
+        return tuple(reversed(left)), tuple(here[len(left) :])
+
+    def positions(self, s: float, u: float) -> tuple[int | None, ...]:
+        """Returns the position of every boundary for a vehicle at (s, u); -1 and +1 bound its lane.
+
+        It is None for a boundary that has ended behind the vehicle or begins ahead of it.
+        """
+        left, right = self.beside(s, u)
+        places = {index: -1 - place for place, index in enumerate(left)}
+        places |= {index: 1 + place for place, index in enumerate(right)}
+        return tuple(places.get(index) for index in range(len(self.boundaries)))

@@ -17,7 +17,7 @@ from lanestream_exporter.scenes.light import Atmosphere, SceneLight
 from lanestream_exporter.scenes.markings import Paintwork
 from lanestream_exporter.scenes.projection import GroundGrid, PinholeCamera, RoadProjection
 from lanestream_exporter.scenes.random_sampler import RandomSampler
-from lanestream_exporter.scenes.road import Boundary, Course, Marking, Pose, Road
+from lanestream_exporter.scenes.road import Boundary, Course, Marking, Pose, Road, Taper
 from lanestream_exporter.scenes.roadside import Wall
 from lanestream_exporter.scenes.scene import sample_course
 from lanestream_exporter.scenes.surface import Surface, SurfaceMaterial
@@ -79,6 +79,28 @@ def test_labels_lie_on_the_center_of_the_paint(plain: Scene, vertical_curvature:
         assert np.abs(errors).max() < 0.5
 
 
+def test_labels_of_a_tapered_boundary_lie_on_its_paint_and_end_with_it(plain: Scene) -> None:
+    taper = Taper(start=30.0, length=25.0, shift=1.5)
+    tapered = Boundary(-3.5, LINE, taper, last=50.0)
+    road = replace(plain.road, boundaries=(Boundary(1.8, LINE), tapered))
+    frame = render_still(replace(plain, road=road))
+    points = frame.labels.lanes[1].points
+    farthest = render_still(replace(plain, road=replace(road, boundaries=(road.boundaries[0], Boundary(-3.5, LINE)))))
+    assert points[-1, 1] > farthest.labels.lanes[1].points[-1, 1] + 15.0
+    inside = points[(points[:, 0] < 600) & (points[:, 1] > points[-1, 1] + 2.0)]
+    assert len(inside) > 8
+    errors = [paint_center(frame.image, x, y, max(8, int(0.4 * (y - 150)))) - x for x, y in inside]
+    assert np.abs(errors).max() < 0.6
+
+
+def test_a_boundary_that_has_ended_or_not_begun_has_no_position() -> None:
+    boundaries = (Boundary(1.8, LINE), Boundary(-1.8, LINE, last=40.0), Boundary(-5.4, LINE, first=30.0))
+    road = Road(Course(40.0, (0.0,)), boundaries, (0.0, -3.6))
+    assert road.positions(20.0, 0.0) == (-1, 1, None)
+    assert road.positions(35.0, 0.0) == (-1, 1, 2)
+    assert road.positions(45.0, 0.0) == (-1, None, 1)
+
+
 def test_labels_of_double_lines_lie_between_the_stripes(plain: Scene) -> None:
     double = replace(LINE, kind="double", width=0.12, gap=0.16)
     scene = replace(plain, road=replace(plain.road, boundaries=(Boundary(1.8, double), Boundary(-1.8, LINE))))
@@ -126,9 +148,9 @@ def test_labels_run_through_vehicles(plain: Scene) -> None:
 
 def test_positions_count_outward_from_the_vehicle() -> None:
     road = Road(Course(40.0, (0.0,)), tuple(Boundary(u, LINE) for u in (5.4, 1.8, -1.8, -5.4)), (3.6, 0.0, -3.6))
-    assert road.positions(0.0) == (-2, -1, 1, 2)
-    assert road.positions(3.0) == (-1, 1, 2, 3)
-    assert road.positions(-6.0) == (-4, -3, -2, -1)
+    assert road.positions(20.0, 0.0) == (-2, -1, 1, 2)
+    assert road.positions(20.0, 3.0) == (-1, 1, 2, 3)
+    assert road.positions(20.0, -6.0) == (-4, -3, -2, -1)
 
 
 def test_labels_end_where_a_wall_hides_the_road(plain: Scene) -> None:
@@ -190,7 +212,7 @@ def lane_change() -> Clip:
         clip = sample_clip(
             np.random.default_rng(seed), 320, 180, 10, 1.0, Drive("highway", lane_change=True, fair=True)
         )
-        if clip.motion.change:
+        if clip.motion.moves:
             return clip
     raise AssertionError("none of 20 sampled highways has two lanes")
 
@@ -221,9 +243,9 @@ def test_timestamps_follow_the_frame_rate(lane_change: Clip) -> None:
 
 def test_a_written_clip_has_one_label_line_per_frame(lane_change: Clip, tmp_path: Path) -> None:
     clip = replace(lane_change, frames=5, fps=20.0)
-    progress: list[tuple[int, int]] = []
+    progress: list[int] = []
     video, labels = tmp_path / "drive.mp4", tmp_path / "drive.jsonl"
-    write_clip(clip, video, labels, lambda done, total: progress.append((done, total)))
+    write_clip(clip, video, labels, progress.append)
     with av.open(str(video)) as container:
         images = [decoded.to_ndarray(format="bgr24") for decoded in container.decode(video=0)]
     assert [image.shape for image in images] == [(180, 320, 3)] * 5
@@ -234,7 +256,7 @@ def test_a_written_clip_has_one_label_line_per_frame(lane_change: Clip, tmp_path
     assert {record["clip"] for record in records} == {"drive.mp4"}
     assert set(records[0]) == {"clip", "frame", "width", "height", "lanes"}
     assert set(records[0]["lanes"][0]) == {"id", "position", "type", "color", "points"}
-    assert progress == [(done, 5) for done in range(1, 6)]
+    assert progress == [1, 2, 3, 4, 5]
 
 
 def test_video_with_odd_sizes_is_rejected(tmp_path: Path) -> None:
