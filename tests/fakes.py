@@ -40,7 +40,7 @@ class FakeDetector:
             curve = Curve(view.horizon, (view.middle, slope, 0.0))
             rows = visible_rows(curve, view)
             if rows is not None:
-                found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9))
+                found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9, expected=True))
         return Detections(tuple(found), view, horizon_weight=1.0)
 
 
@@ -49,6 +49,19 @@ class LeftDetector(FakeDetector):
 
     role = "regressor"
     slopes = (-1.15,)
+
+
+class DriftingDetector(FakeDetector):
+    """Sees a lane 3.2 m wide, 25 times per second, from a camera 1.4 m high that drifts to the right after a second."""
+
+    def __init__(self) -> None:
+        self._frame = 0
+
+    def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
+        offset = max(0.0, 0.5 * (0.04 * self._frame - 1.0))
+        self._frame += 1
+        self.slopes = (-(1.6 + offset) / 1.4, (1.6 - offset) / 1.4)
+        return super().detect(image, context, infer)
 
 
 class FakeModel:
@@ -100,6 +113,11 @@ def engine(model: FakeModel | None = None, detector: FakeDetector | None = None)
 def left_engine() -> Engine:
     """Returns an engine of fakes with one detector, `regression`, which sees only the left boundary."""
     return Engine({"regressor": OtherModel()}, {"regression": LeftDetector()}, _MAIN_ROLES)
+
+
+def drifting_engine() -> Engine:
+    """Returns an engine for one camera, which leaves its lane."""
+    return engine(detector=DriftingDetector())
 
 
 def two_detectors() -> Engine:

@@ -17,7 +17,7 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
 from lanestream.errors import LanestreamError, wire_status
-from lanestream.protocol import DrainingMessage, SummaryMessage, error_message
+from lanestream.protocol import DrainingMessage, ServerMessage, SummaryMessage, error_message
 
 
 class ScriptedConnection:
@@ -45,7 +45,11 @@ class ScriptedConnection:
     def send_lanes(self, *numbers: int) -> None:
         """Answers frames."""
         for seq in numbers:
-            self._connection.send(fakes.lanes(seq).model_dump_json())
+            self.send(fakes.lanes(seq))
+
+    def send(self, message: ServerMessage) -> None:
+        """Sends any message."""
+        self._connection.send(message.model_dump_json())
 
     def send_error(self, error: LanestreamError, seq: int | None = None) -> None:
         """Sends the error of a frame, or one that ends the stream if `seq` is None."""

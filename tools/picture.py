@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from lanestream.local import LocalEngine
+from lanestream.protocol import CameraModel
 from lanestream_client.overlays import draw_lanes
 from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
@@ -19,7 +20,9 @@ def main(out: Path) -> None:
     """Writes the image to `out`."""
     drive = Drive("highway", lane_change=True, fair=True)
     clip = sample_clip(np.random.default_rng(SEED), WIDTH, HEIGHT, frames=FRAMES, fps=FPS, drive=drive)
-    camera = LocalEngine.load(None, "cpu").open_camera()
+    lens = clip.scene.camera
+    model = CameraModel(height=lens.mount_height, field_of_view=lens.field_of_view)
+    camera = LocalEngine.load(None, "cpu").open_camera(camera=model)
     for seq, frame in enumerate(render_clip(clip)):
         lanes = camera.lanes(frame.image, seq=seq, timestamp=frame.timestamp)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """The Lanestream client: sends frames to a service and receives lane lines."""
 
-from lanestream.protocol import CameraModel
+from lanestream.protocol import CameraModel, DepartureOptions
 from lanestream_client.async_client import AsyncLaneClient, AsyncLaneStream
 from lanestream_client.client import LaneClient, LaneStream
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
@@ -9,6 +9,7 @@ __all__ = [
     "AsyncLaneClient",
     "AsyncLaneStream",
     "CameraModel",
+    "DepartureOptions",
     "LaneClient",
     "LaneStream",
     "SourceFrame",

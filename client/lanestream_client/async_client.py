@@ -16,7 +16,15 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from lanestream.errors import LanestreamError
-from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage
+from lanestream.protocol import (
+    CameraModel,
+    DepartureOptions,
+    DetectorName,
+    LanesMessage,
+    Mode,
+    ReadyMessage,
+    WarningMessage,
+)
 from lanestream_client import requests
 from lanestream_client.client_protocol import ClientProtocol
 from lanestream_client.endpoint import (
@@ -95,6 +103,7 @@ class AsyncLaneClient:
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        departure: DepartureOptions | None = None,
         session: str | None = None,
     ) -> AsyncLaneStream:
         """Returns the results of one camera's frames, in frame order, as they arrive; see LaneClient.stream.
@@ -102,7 +111,7 @@ class AsyncLaneClient:
         A source that is not an async iterable is read in a thread, because it may block.
         """
         source = frames if isinstance(frames, AsyncIterable) else _read_in_thread(frames)
-        start = requests.start_message(mode, horizon, detector, camera, session)
+        start = requests.start_message(mode, horizon, detector, camera, departure, session)
         failover = FailoverPolicy(self._endpoints, self._retry, self._timeout)
         return AsyncLaneStream(failover, source, ClientProtocol(start, in_flight=self._in_flight))
 
@@ -137,6 +146,11 @@ class AsyncLaneStream:
     def reconnects(self) -> int:
         """How often the stream was opened again after its connection was lost."""
         return self._protocol.reconnects
+
+    @property
+    def warnings(self) -> tuple[WarningMessage, ...]:
+        """The warnings that the service has sent so far, for example of timestamps in milliseconds."""
+        return self._protocol.warnings
 
     @property
     def summary(self) -> StreamSummary | None:

@@ -17,7 +17,15 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from lanestream.errors import LanestreamError
-from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage
+from lanestream.protocol import (
+    CameraModel,
+    DepartureOptions,
+    DetectorName,
+    LanesMessage,
+    Mode,
+    ReadyMessage,
+    WarningMessage,
+)
 from lanestream_client import requests
 from lanestream_client.client_protocol import ClientProtocol
 from lanestream_client.endpoint import (
@@ -102,15 +110,17 @@ class LaneClient:
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        departure: DepartureOptions | None = None,
         session: str | None = None,
     ) -> LaneStream:
         """Returns the results of one camera's frames, in frame order, as they arrive.
 
-        `horizon`, `detector` and `camera` are as for `detect`; `session` is a name for the service's logs. A frame that
-        the service refuses, or whose result is lost with a connection, yields a result with an `error`, and the stream
-        continues. Raises ProtocolError if an argument is not valid.
+        `horizon`, `detector` and `camera` are as for `detect`; `departure` says when to warn of lane departures, which
+        needs a camera; `session` is a name for the service's logs. A frame that the service refuses, or whose result is
+        lost with a connection, yields a result with an `error`, and the stream continues. Raises ProtocolError if an
+        argument is not valid.
         """
-        start = requests.start_message(mode, horizon, detector, camera, session)
+        start = requests.start_message(mode, horizon, detector, camera, departure, session)
         failover = FailoverPolicy(self._endpoints, self._retry, self._timeout)
         return LaneStream(failover, as_source_frames(frames), ClientProtocol(start, in_flight=self._in_flight))
 
@@ -145,6 +155,11 @@ class LaneStream:
     def reconnects(self) -> int:
         """How often the stream was opened again after its connection was lost."""
         return self._protocol.reconnects
+
+    @property
+    def warnings(self) -> tuple[WarningMessage, ...]:
+        """The warnings that the service has sent so far, for example of timestamps in milliseconds."""
+        return self._protocol.warnings
 
     @property
     def summary(self) -> StreamSummary | None:

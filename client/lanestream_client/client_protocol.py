@@ -28,6 +28,7 @@ from lanestream.protocol import (
     ServerMessage,
     StartMessage,
     SummaryMessage,
+    WarningMessage,
     error_message,
     parse_server_message,
 )
@@ -65,7 +66,7 @@ class ClientProtocol:
     At most `in_flight` frames are unanswered at a time. No method blocks. Calls from several threads need a lock.
     `ready` is the service's latest answer to `start`, `reconnects` counts how often the stream was opened again,
     `is_draining` says whether the service announced over the latest socket that it is about to stop, and `summary` is
-    set when the stream has finished.
+    set when the stream has finished. `warnings` are those that the service sent.
     """
 
     def __init__(self, start: StartMessage, *, in_flight: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
@@ -74,6 +75,7 @@ class ClientProtocol:
         self.summary: StreamSummary | None = None
         self.reconnects = 0
         self.is_draining = False
+        self.warnings: tuple[WarningMessage, ...] = ()
         self._start = start
         self._in_flight = in_flight
         self._clock = clock
@@ -142,7 +144,7 @@ class ClientProtocol:
             return []
         frame = pending.frame
         self._pending[frame.seq] = replace(pending, sent=True)
-        header = FrameMessage(seq=frame.seq, timestamp=frame.timestamp)
+        header = FrameMessage(seq=frame.seq, timestamp=frame.timestamp, speed=frame.speed, indicator=frame.indicator)
         return [header.model_dump_json(exclude_none=True), pending.data]
 
     def receive(self, text: str | bytes) -> list[StreamResult]:
@@ -160,6 +162,9 @@ class ClientProtocol:
             if message.code == DrainingError.code:
                 return self._return_to_queue(message.seq)
             return self._settle(message.seq, message)
+        if isinstance(message, WarningMessage):
+            self.warnings += (message,)
+            return []
         if isinstance(message, DrainingMessage):
             self._drain(message.resume_token)
             return []

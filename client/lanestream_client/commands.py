@@ -18,8 +18,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lanestream.errors import ImageError, LanestreamError, SourceError, needs_extra
-from lanestream.protocol import DetectorName, Mode, parse_camera
+from lanestream.protocol import CameraModel, DetectorName, Mode, parse_camera, read_camera_file
 from lanestream_client.client import LaneClient
+from lanestream_client.departure_clips import departure_clips
 from lanestream_client.failover import RetryPolicy
 from lanestream_client.frames import SourceFrame, StreamResult
 from lanestream_client.in_process import InProcessClient, InProcessEngine
@@ -77,6 +78,13 @@ def _common_options(command: _Command) -> _Command:
             help="Row of the horizon as a share of the image height  [default: estimated]",
         ),
         click.option(
+            "--camera",
+            "camera_file",
+            type=click.Path(path_type=Path),
+            metavar="FILE",
+            help="Camera file, such as `lanestream calibrate` writes; lanes are also given in meters.",
+        ),
+        click.option(
             "--camera-height",
             type=click.FloatRange(0.3, 4.0),
             metavar="M",
@@ -112,6 +120,7 @@ def detect(
     paths: tuple[Path, ...],
     detector: DetectorName | None,
     horizon: float | None,
+    camera_file: Path | None,
     camera_height: float | None,
     field_of_view: float | None,
     jsonl: Path | None,
@@ -120,7 +129,7 @@ def detect(
 ) -> None:
     """Find lanes in images: files, or folders of them. Each image is processed on its own."""
     files = _image_files(paths)
-    camera = parse_camera(camera_height, field_of_view)
+    camera = _camera(camera_file, camera_height, field_of_view)
     report = RunReport()
     with ExitStack() as stack:
         service = stack.enter_context(_open_service(context.obj, **where))
@@ -167,6 +176,19 @@ def detect(
     help="Give up after this time without a connection; 0 disables reconnecting  [default: 30]",
 )
 @click.option("--session", metavar="NAME", help="Name of the stream in the service's logs.")
+@click.option(
+    "--record-departures",
+    type=click.FloatRange(0.1, 600.0),
+    metavar="SECONDS",
+    help="Record a clip with lanes from this long before each lane departure until this long after it.",
+)
+@click.option(
+    "--departures-folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="departures",
+    show_default=True,
+    help="Folder for the clips of --record-departures.",
+)
 @click.pass_context
 def stream(
     context: click.Context,
@@ -174,6 +196,7 @@ def stream(
     source: str,
     detector: DetectorName | None,
     horizon: float | None,
+    camera_file: Path | None,
     camera_height: float | None,
     field_of_view: float | None,
     jsonl: Path | None,
@@ -181,21 +204,28 @@ def stream(
     video: Path | None,
     fps: float,
     session: str | None,
+    record_departures: float | None,
+    departures_folder: Path,
     **where: Any,
 ) -> None:
     """Track the lanes in the frames of one camera.
 
     SOURCE is a video file, a folder of images, a camera number or an rtsp:// or http:// URL.
     """
-    camera = parse_camera(camera_height, field_of_view)
+    camera = _camera(camera_file, camera_height, field_of_view)
     if session is not None and not where["url"]:
         raise click.UsageError("--session needs a service: add --url")
+    if record_departures is not None and camera is None:
+        raise click.UsageError(
+            "--record-departures needs the camera: add --camera, or --camera-height and --field-of-view"
+        )
     with ExitStack() as stack:
         frames = stack.enter_context(open_source(source, fps))
         service = stack.enter_context(_open_service(context.obj, **where))
         sinks = [
             stack.enter_context(json_lines_sink(jsonl)),
             stack.enter_context(video_sink(video, frames.fps)),
+            clips := stack.enter_context(departure_clips(departures_folder, record_departures, frames.fps)),
         ]
         run = _StreamRun([sink for sink in sinks if sink is not None])
         mode = mode or ("latest" if frames.live else "all")
@@ -207,6 +237,8 @@ def stream(
                 click.echo(run.report_text(service, detector), err=_is_stdout(jsonl))
             raise
         click.echo(run.report_text(service, detector), err=_is_stdout(jsonl))
+        for path in [] if clips is None else clips.paths:
+            click.echo(f"departure: {path}", err=_is_stdout(jsonl))
     context.exit(_EXIT_INTERRUPTED if interrupted else 0)
 
 
@@ -219,6 +251,7 @@ class _StreamRun:
         self._dropped = 0
         self._info: ServiceInfo | None = None
         self._reconnects = 0
+        self._warned = 0
 
     def process(self, start: Callable[..., ResultStream], source: CameraSource, mode: Mode) -> bool:
         """Streams the source. Returns whether the user interrupted it, which is how a live stream ends."""
@@ -233,9 +266,11 @@ class _StreamRun:
                 with closing(iter(results)) as iterator:
                     for result in iterator:
                         self._check_connection(results)
+                        self._report_warnings(results)
                         self._write(result)
                         advance()
                 self._check_connection(results)
+                self._report_warnings(results)
             except KeyboardInterrupt:
                 interrupted = True
             finally:
@@ -253,6 +288,11 @@ class _StreamRun:
             click.echo(f"frame {result.frame.seq}: {result.error.message}", err=True)
         for sink in self._sinks:
             sink.write_result(result)
+
+    def _report_warnings(self, results: ResultStream) -> None:
+        for warning in results.warnings[self._warned :]:
+            click.echo(f"warning: {warning.message}; {warning.hint}", err=True)
+        self._warned = len(results.warnings)
 
     def _check_connection(self, results: ResultStream) -> None:
         """Notes what the service runs, and reports a connection that was lost and restored."""
@@ -297,6 +337,15 @@ def _progress_bar(label: str, length: int | None) -> Iterator[Callable[[], None]
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task(label, total=length)
         yield lambda: bar.advance(task)
+
+
+def _camera(file: Path | None, height: float | None, field_of_view: float | None) -> CameraModel | None:
+    """Returns the camera that the options describe. Raises UsageError and ProtocolError."""
+    if file is None:
+        return parse_camera(height, field_of_view)
+    if height is not None or field_of_view is not None:
+        raise click.UsageError("--camera can't be used with --camera-height and --field-of-view: the file has both")
+    return read_camera_file(file)
 
 
 def _image_files(paths: Sequence[Path]) -> list[Path]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import ImageError, needs_extra
-from lanestream.protocol import ErrorMessage, LanesMessage
+from lanestream.protocol import ErrorMessage, Indicator, LanesMessage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,7 +23,8 @@ _JPEG_QUALITY: Final = 90
 class SourceFrame:
     """A frame as its source delivers it: an image file in `data`, or decoded `pixels`, BGR (H, W, 3) uint8.
 
-    `timestamp` is the capture time in seconds on the source's clock. If it is None, the receiver assigns one.
+    `timestamp` is the capture time in seconds on the source's clock. If it is None, the receiver assigns one. `speed`
+    in m/s and `indicator` are the vehicle's then, for lane departure warnings.
     """
 
     seq: int
@@ -31,6 +32,8 @@ class SourceFrame:
     data: bytes | None = None
     pixels: BgrImage | None = None
     name: str = ""
+    speed: float | None = None
+    indicator: Indicator | None = None
 
     def encoded(self) -> bytes:
         """Returns the frame as an image file: the original file, or a JPEG of `pixels`."""

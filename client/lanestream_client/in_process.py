@@ -11,7 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from lanestream.errors import LanestreamError
-from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, ReadyMessage, error_message
+from lanestream.protocol import (
+    CameraModel,
+    DepartureOptions,
+    DetectorName,
+    Indicator,
+    LanesMessage,
+    Mode,
+    ReadyMessage,
+    WarningMessage,
+    error_message,
+)
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
 from lanestream_client.requests import ServiceInfo, read_image_file
 
@@ -30,6 +40,11 @@ class ResultStream(Protocol):
     @property
     def reconnects(self) -> int:
         """How often the stream was opened again after its connection was lost."""
+        ...
+
+    @property
+    def warnings(self) -> tuple[WarningMessage, ...]:
+        """What was wrong with the frames so far without being an error."""
         ...
 
     @property
@@ -66,6 +81,7 @@ class LaneService(Protocol):
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        departure: DepartureOptions | None = None,
         session: str | None = None,
     ) -> ResultStream:
         """Returns the results of one camera's frames."""
@@ -98,7 +114,20 @@ class InProcessNetwork(Protocol):
 class InProcessSession(Protocol):
     """One camera's session with the engine."""
 
-    def lanes(self, image: bytes | BgrImage, *, seq: int, timestamp: float) -> LanesMessage:
+    @property
+    def warnings(self) -> tuple[WarningMessage, ...]:
+        """What was wrong with the frames so far without being an error."""
+        ...
+
+    def lanes(
+        self,
+        image: bytes | BgrImage,
+        *,
+        seq: int,
+        timestamp: float,
+        speed: float | None = None,
+        indicator: Indicator | None = None,
+    ) -> LanesMessage:
         """Returns the lanes of one frame, an image file or BGR pixels (H, W, 3) uint8."""
         ...
 
@@ -111,9 +140,15 @@ class InProcessEngine(Protocol):
         ...
 
     def open_camera(
-        self, horizon: float | None = None, detector: DetectorName | None = None, camera: CameraModel | None = None
+        self,
+        horizon: float | None = None,
+        detector: DetectorName | None = None,
+        camera: CameraModel | None = None,
+        departure: DepartureOptions | None = None,
+        *,
+        single_image: bool = False,
     ) -> InProcessSession:
-        """Opens a session for one camera. Raises NoDetectorError."""
+        """Opens a session for one camera, or for a single image. Raises NoDetectorError."""
         ...
 
 
@@ -140,7 +175,7 @@ class InProcessClient:
         camera: CameraModel | None = None,
     ) -> LanesMessage:
         """Returns the lanes of one image file. Raises ImageError, SourceError and NoDetectorError."""
-        session = self._engine.open_camera(horizon, detector, camera)
+        session = self._engine.open_camera(horizon, detector, camera, single_image=True)
         return session.lanes(read_image_file(image), seq=0, timestamp=0.0)
 
     def stream(
@@ -151,6 +186,7 @@ class InProcessClient:
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        departure: DepartureOptions | None = None,
         session: str | None = None,
     ) -> InProcessStream:
         """Returns the results of one camera's frames. In either mode a frame is read when the previous one is done.
@@ -158,7 +194,7 @@ class InProcessClient:
         Raises NoDetectorError if the detector is not loaded.
         """
         del mode, session  # frames are never queued, so no mode applies; streams are not logged
-        return InProcessStream(self._engine.open_camera(horizon, detector, camera), as_source_frames(frames))
+        return InProcessStream(self._engine.open_camera(horizon, detector, camera, departure), as_source_frames(frames))
 
 
 class InProcessStream:
@@ -178,6 +214,11 @@ class InProcessStream:
         self._clock = clock
         self.summary: StreamSummary | None = None
 
+    @property
+    def warnings(self) -> tuple[WarningMessage, ...]:
+        """What was wrong with the frames so far without being an error, for example timestamps in milliseconds."""
+        return self._session.warnings
+
     def __iter__(self) -> Generator[StreamResult]:
         started = self._clock()
         answered = failed = 0
@@ -185,7 +226,9 @@ class InProcessStream:
             timestamp = self._clock() - started if frame.timestamp is None else frame.timestamp
             image = frame.encoded() if frame.pixels is None else frame.pixels
             try:
-                lanes = self._session.lanes(image, seq=frame.seq, timestamp=timestamp)
+                lanes = self._session.lanes(
+                    image, seq=frame.seq, timestamp=timestamp, speed=frame.speed, indicator=frame.indicator
+                )
             except LanestreamError as error:
                 failed += 1
                 yield StreamResult(frame, error=error_message(error, seq=frame.seq))

@@ -13,7 +13,15 @@ import httpx
 from pydantic import ValidationError
 
 from lanestream.errors import NoDetectorError, ProtocolError, SourceError
-from lanestream.protocol import CameraModel, DetectorName, LanesMessage, Mode, StartMessage, parse_client_message
+from lanestream.protocol import (
+    CameraModel,
+    DepartureOptions,
+    DetectorName,
+    LanesMessage,
+    Mode,
+    StartMessage,
+    parse_client_message,
+)
 from lanestream_client.endpoint import refusal_error
 
 
@@ -44,12 +52,24 @@ def detect_query(
     """Returns the query parameters of `/v1/detect`."""
     given: dict[str, float | str | None] = {"horizon": horizon, "detector": detector}
     if camera is not None:
-        given |= {"camera_height": camera.height, "field_of_view": camera.field_of_view}
+        given |= _camera_parameters(camera)
     return {name: value for name, value in given.items() if value is not None}
 
 
+def _camera_parameters(camera: CameraModel) -> dict[str, float | str | None]:
+    """Returns the query parameters of a camera: two numbers, which older services know too, or all as JSON."""
+    if camera.model_dump(exclude_defaults=True).keys() == {"height", "field_of_view"}:
+        return {"camera_height": camera.height, "field_of_view": camera.field_of_view}
+    return {"camera": camera.model_dump_json(exclude_defaults=True)}
+
+
 def start_message(
-    mode: Mode, horizon: float | None, detector: DetectorName | None, camera: CameraModel | None, session: str | None
+    mode: Mode,
+    horizon: float | None,
+    detector: DetectorName | None,
+    camera: CameraModel | None,
+    departure: DepartureOptions | None,
+    session: str | None,
 ) -> StartMessage:
     """Returns the message that opens a stream. Raises ProtocolError if an argument is not valid."""
     fields = {
@@ -57,7 +77,8 @@ def start_message(
         "mode": mode,
         "horizon": horizon,
         "detector": detector,
-        "camera": None if camera is None else camera.model_dump(),
+        "camera": None if camera is None else camera.model_dump(exclude_defaults=True),
+        "departure": None if departure is None else departure.model_dump(),
         "session": session,
     }
     try:

@@ -14,6 +14,11 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
         "extra": "video",
         "help": "Render a clip of a road with exact labels.",
     },
+    "calibrate": {
+        "target": "lanestream_exporter.calibration_commands:calibrate",
+        "extra": "service,cpu",
+        "help": "Make a camera file from pictures of a chessboard, or from a drive.",
+    },
     "data": {
         "target": "lanestream_exporter.data_commands:data",
         "extra": "export",
@@ -32,7 +37,7 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
     "evaluate": {
         "target": "lanestream_exporter.evaluation_commands:evaluate",
         "extra": "export,service,cpu",
-        "help": "Measure a model's accuracy.",
+        "help": "Measure the accuracy of models and of tracking.",
     },
     "score": {
         "target": "lanestream_exporter.evaluation_commands:score",

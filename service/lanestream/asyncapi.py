@@ -36,6 +36,12 @@ class _Draft7(GenerateJsonSchema):
             generated["items"] = generated.pop("prefixItems")
         return generated
 
+    def tagged_union_schema(self, schema: core_schema.TaggedUnionSchema) -> JsonSchemaValue:
+        """Omits the `discriminator` of OpenAPI, which AsyncAPI defines differently."""
+        generated = super().tagged_union_schema(schema)
+        generated.pop("discriminator", None)
+        return generated
+
 
 def document() -> dict[str, Any]:
     """Returns the AsyncAPI document as plain values."""
@@ -118,7 +124,7 @@ def _operations() -> dict[str, Any]:
     notify = {
         "action": "send",
         "channel": {"$ref": _STREAM},
-        "summary": "Messages that answer no message: fatal errors, and the announcement that the service stops.",
+        "summary": "Messages that answer no message: warnings, fatal errors, and the announcement of a stop.",
         "messages": _message_refs(["error", *unsolicited]),
     }
     return {**received, "notify": notify}

@@ -21,7 +21,8 @@ from lanestream.inference.model_info import ClassifierInfo, RegressorInfo
 from lanestream.inference.providers import AUTO, DEFAULT_OPTIONS, RuntimeOptions
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image
-from lanestream.session import Session
+from lanestream.session import DEFAULT_SESSION, Session, SessionOptions
+from lanestream.tracking.departure import UNKNOWN_MOTION, VehicleMotion
 
 # The shipped networks, which are the default.
 SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
@@ -64,15 +65,19 @@ class Engine:
         """Returns the model that `detector`, or the default one, requires. Raises NoDetectorError if missing."""
         return self.models[self.main_roles[self.select(detector)]]
 
-    def open_session(self, horizon: float | None = None, detector: str | None = None) -> Session:
-        """Returns a session for one camera; `horizon` is its row as a share of the image height, estimated if None.
+    def open_session(self, options: SessionOptions = DEFAULT_SESSION) -> Session:
+        """Returns a session for one camera. Raises NoDetectorError if its detector is not loaded."""
+        return Session(self.detectors[self.select(options.detector)], options)
 
-        Raises NoDetectorError if `detector` is not loaded.
-        """
-        return Session(self.detectors[self.select(detector)], horizon)
-
-    def process(self, session: Session, image: Image, timestamp: float) -> FrameResult:
-        """Processes one frame in the calling thread; the result's timing has the milliseconds of each stage."""
+    def process(
+        self,
+        session: Session,
+        image: Image,
+        timestamp: float,
+        motion: VehicleMotion = UNKNOWN_MOTION,
+        size: tuple[int, int] | None = None,
+    ) -> FrameResult:
+        """Processes one frame in the calling thread, see `Session.process`; the timing has `infer` too."""
         infer_s = 0.0
 
         def infer(role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -82,7 +87,7 @@ class Engine:
             infer_s += time.perf_counter() - started
             return outputs
 
-        result = session.process(image, timestamp, infer)
+        result = session.process(image, timestamp, infer, motion, size)
         return replace(result, timing_ms={**result.timing_ms, "infer": 1e3 * infer_s})
 
 

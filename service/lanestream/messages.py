@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from statistics import fmean
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from lanestream.protocol import (
-    CameraModel,
+    CalibrationChangedModel,
+    CalibrationModel,
+    DepartureEventModel,
+    DepartureModel,
     EgoModel,
+    EventModel,
     LaneChangeModel,
     LaneModel,
     LanesMessage,
     LineModel,
     Point,
+    SceneCutModel,
     TimingModel,
 )
-from lanestream.road.camera import Camera
 from lanestream.road.curve import Curves
+from lanestream.road.results import CalibrationChanged, DepartureEvent, EgoMeters, LaneChange, SceneCut
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lanestream.images.decoding import DecodedImage
     from lanestream.road.curve import FloatArray
-    from lanestream.road.results import EgoLane, FrameResult, LaneBoundary
+    from lanestream.road.results import Calibration, Departure, EgoLane, Estimate, Event, FrameResult, LaneBoundary
 
 _POINTS: Final = 24
 # Decimals that keep a curve exact to a hundredth of a pixel over the tallest accepted image.
@@ -36,7 +39,8 @@ _COEFFICIENT_DECIMALS: Final = (4, 7, 4)
 # Decimals that keep a point on the road exact to a millimeter at a distance of a hundred meters.
 _GROUND_DECIMALS: Final = (8, 6, 4)
 
-GroundCurve = tuple[float, float, float]
+_TIME_DECIMALS: Final = 6
+_DEGREE_DECIMALS: Final = 3
 
 
 @dataclass(frozen=True)
@@ -52,36 +56,27 @@ class ProcessedFrame:
         return cls(picture.size, replace(result.to_image(picture.scaling), timing_ms=timing_ms))
 
 
-def lanes_message(
-    frame: ProcessedFrame, *, seq: int, timestamp: float, dropped: int = 0, camera: CameraModel | None = None
-) -> LanesMessage:
-    """Returns the message for `frame`; `timestamp` is in seconds on the client's clock. A `camera` adds meters."""
+def lanes_message(frame: ProcessedFrame, *, seq: int, timestamp: float, dropped: int = 0) -> LanesMessage:
+    """Returns the message for `frame`; `timestamp` is in seconds on the client's clock."""
     width, height = frame.size
     result = frame.result
-    grounds = {} if camera is None else _grounds(result, Camera(camera.height, camera.field_of_view), width)
     return LanesMessage(
         seq=seq,
         timestamp=timestamp,
         width=width,
         height=height,
         horizon=round(result.horizon, 2),
-        lanes=[
-            _lane(lane, points, grounds.get(lane.track_id))
-            for lane, points in zip(result.lanes, _points(result.lanes), strict=True)
-        ],
-        ego=_ego(result.ego, grounds),
-        events=[LaneChangeModel(track_id=event.track_id, direction=event.direction) for event in result.events],
+        lanes=[_lane(lane, points) for lane, points in zip(result.lanes, _points(result.lanes), strict=True)],
+        ego=_ego(result.ego),
+        departure=None if result.departure is None else _departure(result.departure),
+        calibration=None if result.calibration is None else _calibration(result.calibration),
+        events=[_event(event) for event in result.events],
         dropped=dropped,
         timing_ms=TimingModel(**{stage: round(ms, 3) for stage, ms in result.timing_ms.items()}),
     )
 
 
-def _grounds(result: FrameResult, camera: Camera, width: int) -> dict[int, GroundCurve]:
-    """Returns the ground parabola of each lane by track id."""
-    return {lane.track_id: camera.ground(lane.curve, width) for lane in result.lanes}
-
-
-def _lane(lane: LaneBoundary, points: list[Point], ground: GroundCurve | None) -> LaneModel:
+def _lane(lane: LaneBoundary, points: list[Point]) -> LaneModel:
     return LaneModel(
         track_id=lane.track_id,
         position=lane.position,
@@ -93,11 +88,12 @@ def _lane(lane: LaneBoundary, points: list[Point], ground: GroundCurve | None) -
         coefficients=_rounded(lane.curve.coefficients, _COEFFICIENT_DECIMALS),
         covariance=_significant(lane.covariance),
         age_s=round(lane.age_s, 3),
-        ground=None if ground is None else _rounded(ground, _GROUND_DECIMALS),
+        ground=None if lane.ground is None else _rounded(lane.ground, _GROUND_DECIMALS),
+        ground_covariance=None if lane.ground_covariance is None else _significant(lane.ground_covariance),
     )
 
 
-def _rounded(values: GroundCurve, decimals: tuple[int, int, int]) -> GroundCurve:
+def _rounded(values: tuple[float, float, float], decimals: tuple[int, int, int]) -> tuple[float, float, float]:
     a, b, c = (round(value, digits) for value, digits in zip(values, decimals, strict=True))
     return a, b, c
 
@@ -117,14 +113,54 @@ def _significant(matrix: FloatArray) -> list[list[float]]:
     return [[float(f"{value:.6g}") for value in row] for row in matrix]
 
 
-def _ego(ego: EgoLane, grounds: dict[int, GroundCurve]) -> EgoModel:
-    model = EgoModel(left=ego.left, right=ego.right, offset=None if ego.offset is None else round(ego.offset, 4))
-    sides = [grounds[track] for track in (ego.left, ego.right) if track in grounds]
-    if not sides:
-        return model
-    a, b, c = (fmean(values) for values in zip(*sides, strict=True))
-    in_meters = {"heading": round(math.atan(b), 6), "curvature": round(2.0 * a, 8)}
-    if len(sides) == 2:
-        # Y points left: a lane center at +c means that the camera is c to the right of it.
-        in_meters |= {"offset_m": round(c, 3), "lane_width_m": round(sides[0][2] - sides[1][2], 3)}
-    return model.model_copy(update=in_meters)
+def _ego(ego: EgoLane) -> EgoModel:
+    meters = ego.meters or EgoMeters()
+    return EgoModel(
+        left=ego.left,
+        right=ego.right,
+        **_estimate("offset", ego.offset, 4),
+        **_estimate("offset_m", meters.offset, 3),
+        **_estimate("lane_width_m", meters.lane_width, 3),
+        **_estimate("heading", meters.heading, 6),
+        **_estimate("curvature", meters.curvature, 8),
+        **_estimate("lateral_speed", meters.lateral_speed, 3),
+    )
+
+
+def _estimate(name: str, estimate: Estimate | None, decimals: int) -> dict[str, float | None]:
+    """Returns the fields of an estimate: its value and its sigma."""
+    if estimate is None:
+        return {name: None, f"{name}_sigma": None}
+    return {name: round(estimate.value, decimals), f"{name}_sigma": round(estimate.sigma, decimals)}
+
+
+def _departure(departure: Departure) -> DepartureModel:
+    time_s = departure.time_to_crossing
+    return DepartureModel(
+        state=departure.state, side=departure.side, time_to_crossing=None if time_s is None else round(time_s, 3)
+    )
+
+
+def _calibration(calibration: Calibration) -> CalibrationModel:
+    return CalibrationModel(
+        pitch=round(calibration.pitch.value, _DEGREE_DECIMALS),
+        pitch_sigma=round(calibration.pitch.sigma, _DEGREE_DECIMALS),
+        yaw=round(calibration.yaw.value, _DEGREE_DECIMALS),
+        yaw_sigma=round(calibration.yaw.sigma, _DEGREE_DECIMALS),
+        settled=calibration.settled,
+    )
+
+
+def _event(event: Event) -> EventModel:
+    timestamp = round(event.timestamp, _TIME_DECIMALS)
+    match event:
+        case LaneChange():
+            return LaneChangeModel(track_id=event.track_id, direction=event.direction, timestamp=timestamp)
+        case DepartureEvent():
+            return DepartureEventModel(state=event.state, side=event.side, track_id=event.track_id, timestamp=timestamp)
+        case CalibrationChanged():
+            return CalibrationChangedModel(
+                pitch=round(event.pitch, _DEGREE_DECIMALS), yaw=round(event.yaw, _DEGREE_DECIMALS), timestamp=timestamp
+            )
+        case SceneCut():
+            return SceneCutModel(timestamp=timestamp)

@@ -9,9 +9,12 @@ AsyncAPI document follow from that; `StreamProtocol` and the client give it its 
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Final, Literal
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from lanestream.errors import LanestreamError, ProtocolError, one_line
 
@@ -23,13 +26,23 @@ MAX_SEQ: Final = 2**53 - 1
 # The largest text message that the service reads, and the most values in it: parsing must stay cheap for any text.
 MOST_TEXT_BYTES: Final = 1 << 16
 _MOST_VALUES: Final = 64
+# The highest speed of a vehicle in m/s that is accepted.
+_MOST_SPEED: Final = 150.0
 
 Point = tuple[float, float]
 Mode = Literal["latest", "all"]
 SessionName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 DetectorName = Literal["candidates", "regression"]
+Side = Literal["left", "right"]
+Indicator = Literal["off", "left", "right"]
+WarningCode = Literal["timestamps_in_milliseconds", "timestamps_not_advancing"]
 CameraHeight = Annotated[float, Field(ge=0.3, le=4.0, description="Height of the camera above the road in meters.")]
 FieldOfView = Annotated[float, Field(ge=20.0, le=150.0, description="Horizontal field of view in degrees.")]
+Auto = Literal["auto"]
+FocalLength = Annotated[float, Field(ge=10.0, le=1e5)]
+ImageSide = Annotated[int, Field(ge=64, le=1 << 16)]
+PixelCoordinate = Annotated[float, Field(ge=-1e5, le=1e5)]
+DistortionCoefficient = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 
 class Message(BaseModel):
@@ -46,10 +59,69 @@ class Message(BaseModel):
 
 
 class CameraModel(Message):
-    """The camera parameters that coordinates in meters need. The camera looks ahead over a flat road."""
+    """The camera parameters that coordinates in meters need, over a flat road.
+
+    A camera file holds this object as JSON. Either `field_of_view` or `focal_length` is required. With `auto`, pitch or
+    yaw are estimated while driving; without a pitch, that of each frame follows from its horizon.
+    """
 
     height: CameraHeight
-    field_of_view: FieldOfView
+    field_of_view: FieldOfView | None = None
+    focal_length: tuple[FocalLength, FocalLength] | None = Field(
+        default=None, description="[fx, fy] in pixels of an image of `image_size`."
+    )
+    principal_point: tuple[PixelCoordinate, PixelCoordinate] | None = Field(
+        default=None, description="[cx, cy] in pixels of an image of `image_size`; its middle if missing."
+    )
+    image_size: tuple[ImageSide, ImageSide] | None = Field(
+        default=None, description="[width, height] of the images that were calibrated; that of the frames if missing."
+    )
+    distortion: tuple[
+        DistortionCoefficient,
+        DistortionCoefficient,
+        DistortionCoefficient,
+        DistortionCoefficient,
+        DistortionCoefficient,
+    ] = Field(default=(0.0, 0.0, 0.0, 0.0, 0.0), description="OpenCV's [k1, k2, p1, p2, k3].")
+    pitch: Annotated[float, Field(ge=-20.0, le=60.0)] | Auto | None = Field(
+        default=None, description="Degrees that the camera looks down, or `auto`."
+    )
+    yaw: Annotated[float, Field(ge=-45.0, le=45.0)] | Auto = Field(
+        default=0.0, description="Degrees that the camera looks to the left of the vehicle's direction, or `auto`."
+    )
+    roll: float = Field(
+        default=0.0,
+        ge=-30.0,
+        le=30.0,
+        description="Degrees that the camera is turned clockwise, as the driver sees it.",
+    )
+    lateral: float = Field(
+        default=0.0, ge=-2.0, le=2.0, description="Meters that the camera is left of the vehicle's middle."
+    )
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if (self.field_of_view is None) == (self.focal_length is None):
+            raise ValueError("give either field_of_view or focal_length")
+        if self.principal_point is not None and self.image_size is not None:
+            (x, y), (width, height) = self.principal_point, self.image_size
+            if not (0.0 <= x <= width - 1.0 and 0.0 <= y <= height - 1.0):
+                raise ValueError("principal_point is outside of image_size")
+        return self
+
+
+class DepartureOptions(Message):
+    """When to warn of lane departures, which needs a camera. The service's settings apply to missing fields."""
+
+    vehicle_width: Annotated[float, Field(ge=0.5, le=4.0)] | None = Field(
+        default=None, description="Width of the vehicle over the outer edges of its wheels in meters."
+    )
+    warning_s: Annotated[float, Field(ge=0.0, le=5.0)] | None = Field(
+        default=None, description="Seconds before a line is crossed in which a warning comes."
+    )
+    least_speed: Annotated[float, Field(ge=0.0, le=_MOST_SPEED)] | None = Field(
+        default=None, description="Below this speed in m/s no warning comes, if frames report the speed."
+    )
 
 
 class StartMessage(Message):
@@ -77,12 +149,18 @@ class StartMessage(Message):
         default=None, description="Row of the horizon as a fraction of the image height; estimated if missing."
     )
     camera: CameraModel | None = Field(default=None, description="If present, lanes are also reported in meters.")
+    departure: DepartureOptions | None = Field(
+        default=None, description="When to warn of lane departures; the service's settings if missing."
+    )
 
 
 class FrameMessage(Message):
-    """Client: number and capture time of the binary message that follows. The service assigns missing fields."""
+    """Client: number, capture time and motion for the binary message that follows.
 
-    example = {"type": "frame", "seq": 7, "timestamp": 0.28}
+    The service assigns a missing number and a missing time.
+    """
+
+    example = {"type": "frame", "seq": 7, "timestamp": 0.28, "speed": 24.5, "indicator": "off"}
     replies = ("lanes", "error")
 
     type: Literal["frame"] = "frame"
@@ -90,6 +168,10 @@ class FrameMessage(Message):
     timestamp: Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)] | None = Field(
         default=None, description="Capture time in seconds, on any clock that does not run backwards."
     )
+    speed: Annotated[float, Field(ge=0.0, le=_MOST_SPEED, allow_inf_nan=False)] | None = Field(
+        default=None, description="Speed of the vehicle in m/s."
+    )
+    indicator: Indicator | None = Field(default=None, description="Direction indicator of the vehicle.")
 
 
 class EndMessage(Message):
@@ -144,7 +226,10 @@ class LaneModel(Message):
 
     track_id: int
     position: int = Field(description="-1 is ego left, +1 ego right, -2 and +2 are the next boundaries outwards.")
-    state: Literal["detected", "predicted"]
+    state: Literal["detected", "inferred", "predicted"] = Field(
+        description="`detected` in this frame, `inferred` from the road where little or no paint was seen, or"
+        " `predicted` only."
+    )
     probability: float
     points: list[Point] = Field(description="Points on the curve, from the lowest row to the highest.")
     line: LineModel
@@ -154,8 +239,12 @@ class LaneModel(Message):
     age_s: float
     ground: tuple[float, float, float] | None = Field(
         default=None,
-        description="[a, b, c] of Y = a X^2 + b X + c on the road, in meters from the camera: X forward, Y left."
+        description="[a, b, c] of Y = a X^2 + b X + c on the road, in meters: X forward of the camera, Y left of the"
+        " vehicle's middle."
         " Null without a camera.",
+    )
+    ground_covariance: list[list[float]] | None = Field(
+        default=None, description="3 x 3 covariance of [a, b, c]. Null without a camera."
     )
 
     def x(self, y: float) -> float:
@@ -168,30 +257,94 @@ class LaneModel(Message):
 class EgoModel(Message):
     """The lane the camera is in: the track ids of its boundaries, and the camera's offset from the center.
 
-    `offset` is a fraction of the lane width, positive to the right; null unless both boundaries are known. The other
-    fields need a camera model and apply at the camera: `offset_m` and `lane_width_m` if both boundaries are known,
-    `heading` and `curvature` if at least one is, as the mean of the known ones.
+    `offset` is a fraction of the lane width, positive to the right; null unless both boundaries are known. The fields
+    in meters need a camera model and apply at the vehicle's middle: `offset_m` and `lane_width_m` if both boundaries
+    are known, `heading` and `curvature` if at least one is. Each has its standard deviation in `..._sigma`.
     """
 
     left: int | None
     right: int | None
     offset: float | None
+    offset_sigma: float | None = None
     offset_m: float | None = Field(default=None, description="Offset in meters, positive to the right of the center.")
+    offset_m_sigma: float | None = None
     lane_width_m: float | None = Field(default=None, description="Lane width in meters.")
+    lane_width_m_sigma: float | None = None
     heading: float | None = Field(
         default=None, description="Angle from the vehicle's heading to the lane's in radians, positive to the left."
     )
+    heading_sigma: float | None = None
     curvature: float | None = Field(
         default=None, description="Curvature of the lane in 1/m, positive if it curves to the left."
     )
+    curvature_sigma: float | None = None
+    lateral_speed: float | None = Field(
+        default=None, description="Speed of the vehicle across its lane in m/s, positive to the right."
+    )
+    lateral_speed_sigma: float | None = None
+
+
+class DepartureModel(Message):
+    """Whether the vehicle leaves its lane, and on which side."""
+
+    state: Literal["none", "warning", "crossed"] = Field(
+        default="none",
+        description="`warning` before its wheels cross a boundary, `crossed` from then until they are back inside.",
+    )
+    side: Side | None = Field(default=None, description="Null if the state is `none`.")
+    time_to_crossing: float | None = Field(
+        default=None,
+        description="Seconds until the wheels on the side that the vehicle approaches reach its boundary, at most 10;"
+        " 0 beyond it. Null if it approaches none.",
+    )
+
+
+class CalibrationModel(Message):
+    """The estimated direction of the camera in degrees, if `start` had `auto` for its pitch or its yaw."""
+
+    pitch: float = Field(description="Pitch of the camera, positive if it looks down.")
+    pitch_sigma: float
+    yaw: float = Field(description="Yaw of the camera, positive if it looks to the left.")
+    yaw_sigma: float
+    settled: bool = Field(description="Whether the estimate is good enough to be used.")
 
 
 class LaneChangeModel(Message):
-    """The camera crossed a lane boundary."""
+    """The vehicle's middle, or the camera if that is unknown, crossed a lane boundary."""
 
     type: Literal["lane_change"] = "lane_change"
     track_id: int
-    direction: Literal["left", "right"]
+    direction: Side
+    timestamp: float = Field(description="Time of the crossing, interpolated between frames.")
+
+
+class DepartureEventModel(Message):
+    """A departure warning began, or the vehicle's wheels crossed a boundary of its lane."""
+
+    type: Literal["departure"] = "departure"
+    state: Literal["warning", "crossed"]
+    side: Side
+    track_id: int
+    timestamp: float = Field(description="Time of the warning or the crossing, interpolated between frames.")
+
+
+class SceneCutModel(Message):
+    """The frame shows another scene than the one before: all track ids are new."""
+
+    type: Literal["scene_cut"] = "scene_cut"
+    timestamp: float
+
+
+class CalibrationChangedModel(Message):
+    """The camera points in another direction than before, in degrees."""
+
+    type: Literal["calibration_changed"] = "calibration_changed"
+    pitch: float
+    yaw: float
+    timestamp: float
+
+
+EventModel = LaneChangeModel | DepartureEventModel | SceneCutModel | CalibrationChangedModel
 
 
 class TimingModel(Message):
@@ -217,7 +370,13 @@ class LanesMessage(Message):
     horizon: float
     lanes: list[LaneModel]
     ego: EgoModel
-    events: list[LaneChangeModel]
+    departure: DepartureModel | None = Field(default=None, description="Null without a camera.")
+    calibration: CalibrationModel | None = Field(
+        default=None, description="Null unless the camera's pitch or yaw is `auto`."
+    )
+    events: list[Annotated[EventModel, Field(discriminator="type")]] = Field(
+        description="What happened since the previous frame."
+    )
     dropped: int = Field(description="Frames of this stream that were dropped so far.")
     timing_ms: TimingModel
 
@@ -240,6 +399,39 @@ class ErrorMessage(Message):
     hint: str = ""
     seq: int | None = None
     fatal: bool = False
+
+
+class WarningMessage(Message):
+    """Service: what the client sends is accepted, but probably wrong. Each code comes at most once in a session."""
+
+    example = {
+        "type": "warning",
+        "code": "timestamps_in_milliseconds",
+        "message": "the timestamps of the frames look like milliseconds",
+        "hint": "send the capture time in seconds",
+        "seq": 1,
+    }
+
+    type: Literal["warning"] = "warning"
+    code: WarningCode
+    message: str
+    hint: str
+    seq: int = Field(description="The frame that showed it.")
+
+
+# What each warning says: its message and its hint.
+WARNINGS: Final[Mapping[WarningCode, tuple[str, str]]] = MappingProxyType(
+    {
+        "timestamps_in_milliseconds": (
+            "the timestamps of the frames look like milliseconds",
+            "send the capture time in seconds",
+        ),
+        "timestamps_not_advancing": (
+            "the timestamps of the frames do not advance",
+            "send each frame's own capture time, on a clock that does not run backwards",
+        ),
+    }
+)
 
 
 class DrainingMessage(Message):
@@ -272,7 +464,10 @@ class SummaryMessage(Message):
 
 
 ClientMessage = StartMessage | FrameMessage | EndMessage
-ServerMessage = ReadyMessage | LanesMessage | ErrorMessage | DrainingMessage | SummaryMessage
+ServerMessage = ReadyMessage | LanesMessage | WarningMessage | ErrorMessage | DrainingMessage | SummaryMessage
+
+# What pydantic adds to the location of a value that may have several types.
+_UNION_BRANCHES: Final = ("constrained-float", "float", "literal['auto']")
 
 _CLIENT: Final[TypeAdapter[ClientMessage]] = TypeAdapter(Annotated[ClientMessage, Field(discriminator="type")])
 _SERVER: Final[TypeAdapter[ServerMessage]] = TypeAdapter(Annotated[ServerMessage, Field(discriminator="type")])
@@ -302,10 +497,17 @@ def parse_server_message(text: str) -> ServerMessage:
         raise ProtocolError(f"the service sent an invalid message: {_first_problem(error)}") from None
 
 
-def parse_camera(height: float | None, field_of_view: float | None) -> CameraModel | None:
-    """Returns the camera of two options that belong together; None if both are None. Raises ProtocolError otherwise."""
+def parse_camera(height: float | None, field_of_view: float | None, text: str | None = None) -> CameraModel | None:
+    """Returns the camera of two options that belong together, or of the JSON `text`; None if all are None.
+
+    Raises ProtocolError if it is not valid.
+    """
     if height is None and field_of_view is None:
-        return None
+        return None if text is None else parse_camera_json(text)
+    if text is not None:
+        raise ProtocolError(
+            "the camera is given twice", "give either the whole camera, or its height and its field of view"
+        )
     try:
         return CameraModel.model_validate({"height": height, "field_of_view": field_of_view})
     except ValidationError as error:
@@ -313,6 +515,31 @@ def parse_camera(height: float | None, field_of_view: float | None) -> CameraMod
             f"not a valid camera: {_first_problem(error)}",
             "give both the height (0.3 to 4 m) and the horizontal field of view (20 to 150 degrees), or neither",
         ) from None
+
+
+def parse_camera_json(text: str | bytes) -> CameraModel:
+    """Returns the camera in the JSON object `text`, such as the content of a camera file. Raises ProtocolError."""
+    try:
+        return CameraModel.model_validate_json(text)
+    except ValidationError as error:
+        raise ProtocolError(
+            f"not a valid camera: {_first_problem(error)}",
+            'give a JSON object such as {"height": 1.4, "field_of_view": 62}, see docs/cameras.md',
+        ) from None
+
+
+def read_camera_file(path: Path) -> CameraModel:
+    """Returns the camera in a camera file. Raises ProtocolError, on one line, if it can't be read or is not valid."""
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise ProtocolError(
+            f"can't read {path}: {(error.strerror or str(error)).lower()}", "give a camera file"
+        ) from None
+    try:
+        return parse_camera_json(text)
+    except ProtocolError as error:
+        raise ProtocolError(f"{path}: {error.message}", error.hint) from None
 
 
 def error_message(error: BaseException, *, seq: int | None = None, fatal: bool = False) -> ErrorMessage:
@@ -328,6 +555,12 @@ def error_message(error: BaseException, *, seq: int | None = None, fatal: bool =
     )
 
 
+def warning_message(code: WarningCode, seq: int) -> WarningMessage:
+    """Returns the message that warns of `code`, which the frame `seq` showed."""
+    message, hint = WARNINGS[code]
+    return WarningMessage(code=code, message=message, hint=hint, seq=seq)
+
+
 def json_schemas() -> dict[str, dict[str, Any]]:
     """Returns the JSON Schemas of the messages that the client sends and that the service sends."""
     return {"client": _CLIENT.json_schema(), "server": _SERVER.json_schema(mode="serialization")}
@@ -336,5 +569,6 @@ def json_schemas() -> dict[str, dict[str, Any]]:
 def _first_problem(error: ValidationError) -> str:
     problem = error.errors(include_url=False, include_input=False)[0]
     # Both may quote what was sent, at any length.
-    location, reason = one_line(".".join(map(str, problem["loc"])), 80), one_line(problem["msg"])
+    location = one_line(".".join(str(part) for part in problem["loc"] if part not in _UNION_BRANCHES), 80)
+    reason = one_line(problem["msg"].removeprefix("Value error, "))
     return f"{location}: {reason}" if location else reason

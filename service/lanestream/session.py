@@ -3,16 +3,30 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.interface import Detections, Detector, FrameContext, Infer, ModelRole
+from lanestream.errors import ProtocolError
 from lanestream.images.resizing import working_image
-from lanestream.road.results import FrameResult
+from lanestream.images.scene_cut import SceneMemory
+from lanestream.protocol import CameraModel, DepartureOptions
+from lanestream.road.camera import Camera, Lens
+from lanestream.road.curve import FloatArray
+from lanestream.road.ground import with_meters
+from lanestream.road.results import EgoMeters, FrameResult, SceneCut
 from lanestream.road.view import Image, Scaling
+from lanestream.tracking.calibration import CalibrationState, Calibrator
+from lanestream.tracking.departure import (
+    UNKNOWN_MOTION,
+    DepartureMonitor,
+    DepartureSettings,
+    DepartureState,
+    VehicleMotion,
+)
 from lanestream.tracking.state import MAX_COUNT, TrackerState, check_range
 from lanestream.tracking.tracker import LaneTracker
 
@@ -22,6 +36,47 @@ _HORIZON_GAIN: Final = 0.1
 # Detectors place no horizon lower, because some road must be visible below it.
 _LONGEST_SIDE: Final = 1 << 20
 _HORIZONS: Final = (-1.0, 0.98)
+# How exactly the lowest row of a road filter is that of the images, in pixels.
+_ROUNDING: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """What the caller of a session chooses.
+
+    `horizon` is its row as a share of the image height; if None, it is estimated. `detector` is the name of the
+    detector, by default the service's. With a `camera`, results are also in meters, and departures are warned of as
+    `departure` says. With `single_image`, every boundary of the first frame is reported: no other frame will follow
+    that could confirm it.
+    """
+
+    horizon: float | None = None
+    detector: str | None = None
+    camera: Camera | None = None
+    departure: DepartureSettings = DepartureSettings()
+    single_image: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        horizon: float | None,
+        detector: str | None,
+        camera: CameraModel | None,
+        departure: DepartureOptions | None = None,
+        defaults: DepartureSettings | None = None,
+    ) -> SessionOptions:
+        """Returns the options that a client sends; `defaults` are those of `departure`.
+
+        Raises ProtocolError if two of them contradict each other.
+        """
+        if horizon is not None and camera is not None and isinstance(camera.pitch, float):
+            raise ProtocolError("the horizon and the camera's pitch are both given", "give one; each implies the other")
+        known = None if camera is None else Camera(**camera.model_dump())
+        chosen = {} if departure is None else departure.model_dump(exclude_none=True)
+        return cls(horizon, detector, known, replace(defaults or DepartureSettings(), **chosen))
+
+
+DEFAULT_SESSION: Final = SessionOptions()
 
 
 @dataclass(frozen=True)
@@ -38,6 +93,9 @@ class SessionState:
     prior_horizon: float | None = None
     evidence: float = 0.0
     tracker: TrackerState = field(default_factory=TrackerState)
+    calibration: CalibrationState = field(default_factory=CalibrationState)
+    departure: DepartureState = field(default_factory=DepartureState)
+    scene: SceneMemory = SceneMemory()
 
     def validate(self) -> None:
         """Checks a state from outside this process. Raises ValueError, on one line, if no session can have it."""
@@ -47,28 +105,53 @@ class SessionState:
         check_range("prior_horizon", self.prior_horizon, *_HORIZONS)
         check_range("evidence", self.evidence, 0.0, MAX_COUNT)
         self.tracker.validate()
+        bottom = self.tracker.horizon + self.tracker.depth
+        if self.tracker.filter and (self.size is None or abs(bottom + 1.0 - self.size[1]) > _ROUNDING):
+            raise ValueError("the road filter does not fit the size of the images")
+        self.calibration.validate()
+        self.departure.validate()
+        self.scene.validate()
 
 
 class Session:
     """Tracks the lanes of one camera, frame by frame.
 
-    `horizon` is its row as a share of the image height, if the caller knows it; otherwise it is estimated from the
-    frames and smoothed over time. A frame of another size than the last one resets the tracker.
+    Unless `options` has a horizon, it is estimated from the frames and smoothed over time. A frame of another size than
+    the last one resets the tracker.
     """
 
-    def __init__(self, detector: Detector, horizon: float | None = None) -> None:
+    def __init__(self, detector: Detector, options: SessionOptions = DEFAULT_SESSION) -> None:
         self._detector = detector
-        self._configured = horizon
+        self._configured = options.horizon
+        self._camera = options.camera
+        self._calibrator = None if options.camera is None else Calibrator(options.camera)
         self._size: tuple[int, int] | None = None
         self._horizon: float | None = None
         self._prior_horizon: float | None = None
         self._evidence = 0.0
-        self._tracker = LaneTracker()
+        self._single_image = options.single_image
+        self._tracker = LaneTracker(options.single_image)
+        self._scene = SceneMemory()
+        self._departure = DepartureMonitor(options.departure)
 
     @property
     def state(self) -> SessionState:
         """The complete state. Do not read it while a frame is being processed."""
-        return SessionState(self._size, self._horizon, self._prior_horizon, self._evidence, self._tracker.state)
+        return SessionState(
+            self._size,
+            self._horizon,
+            self._prior_horizon,
+            self._evidence,
+            self._tracker.state,
+            CalibrationState() if self._calibrator is None else self._calibrator.state,
+            self._departure.state,
+            self._scene,
+        )
+
+    @property
+    def nis(self) -> FloatArray:
+        """The normalized innovations squared of the last frame, see `LaneTracker.nis`."""
+        return self._tracker.nis
 
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
         """Continues where `state` was taken; `ids_lost` more track ids count as assigned.
@@ -76,49 +159,87 @@ class Session:
         Raises ValueError for an incomplete state, and leaves the session as it was. A state from outside this process
         needs `SessionState.validate` first, which takes too long for every frame.
         """
-        self._tracker = LaneTracker.restored(state.tracker, ids_lost)
+        self._tracker = LaneTracker.restored(state.tracker, ids_lost, self._single_image)
         self._size, self._horizon, self._evidence = state.size, state.horizon, state.evidence
         self._prior_horizon = state.prior_horizon
+        self._departure.state = state.departure
+        self._scene = state.scene
+        if self._calibrator is not None:
+            self._calibrator.state = state.calibration
 
-    def process(self, image: Image, timestamp: float, infer: Infer) -> FrameResult:
+    def process(
+        self,
+        image: Image,
+        timestamp: float,
+        infer: Infer,
+        motion: VehicleMotion = UNKNOWN_MOTION,
+        size: tuple[int, int] | None = None,
+    ) -> FrameResult:
         """Returns the lanes of one frame, a BGR image (H, W, 3) uint8, in pixels of that image.
 
-        `timestamp` is the capture time in seconds; frames of a session are processed one at a time, in order. The
-        result's timing has the milliseconds of `propose` (without waiting for `infer`), `fit` and `track`. If `infer`
-        raises, the session stays as it was.
+        `timestamp` is the capture time in seconds, and `motion` what the vehicle reported then. `size` is the width and
+        height of the frame if `image` is a smaller copy of it. Frames of a session are processed one at a time, in
+        order. The result's timing has the milliseconds of `propose` (without waiting for `infer`), `fit` and `track`.
+        If `infer` raises, the session stays as it was.
         """
         started = time.perf_counter()
         working, scaling = working_image(image)
+        height, width = working.shape[:2]
+        lens, middle = None, 0.0
+        if self._camera is not None:
+            lens = self._camera.lens(size or (image.shape[1], image.shape[0]), (width, height))
+            middle = self._camera.middle(lens)
+        scene, is_cut = self._scene.next(working, self._tracker.seconds_until(timestamp))
         inference = _TimedInference(infer)
-        detections = self._detector.detect(working, self._context(image, working, scaling), inference)
+        context = self._context(image, working, scaling, lens, is_cut)
+        detections = self._detector.detect(working, context, inference)
         detected = time.perf_counter()
-        self._update_horizon(detections)
-        result = self._tracker.update(detections.boundaries, timestamp, detections.view).to_image(scaling)
+        self._scene = scene
+        self._update_horizon(detections, is_cut)
+        result = self._tracker.update(detections.boundaries, timestamp, detections.view, middle, is_cut)
+        if any(isinstance(event, SceneCut) for event in result.events):
+            self._departure.state = DepartureState()
+        if self._calibrator is not None and lens is not None:
+            result = _with_meters(result, self._calibrator, lens, height - 1.0, timestamp, motion.speed)
+        result = result.to_image(scaling)
         result.timing_ms.update(
             propose=1e3 * (detected - started - inference.waited_s - detections.fit_s),
             fit=1e3 * detections.fit_s,
             track=1e3 * (time.perf_counter() - detected),
         )
-        return result
+        return self._watch_departure(result, timestamp, motion)
 
-    def _context(self, image: Image, working: Image, scaling: Scaling) -> FrameContext:
+    def _watch_departure(self, result: FrameResult, timestamp: float, motion: VehicleMotion) -> FrameResult:
+        """Adds the departure and its events, if the camera is known."""
+        if self._camera is None:
+            return result
+        ego = result.ego
+        meters = ego.meters or EgoMeters()
+        departure, events = self._departure.update(meters, ego.left, ego.right, timestamp, motion)
+        return replace(result, departure=departure, events=result.events + events)
+
+    def _context(self, image: Image, working: Image, scaling: Scaling, lens: Lens | None, is_cut: bool) -> FrameContext:
         height, width = working.shape[:2]
-        is_known = self._size == (width, height)
-        horizon = None if self._horizon is None else self._horizon * height
+        is_known = self._size == (width, height) and not is_cut
+        horizon = None if self._horizon is None or is_cut else self._horizon * height
         if self._configured is not None:
             horizon = scaling.to_working(self._configured * image.shape[0])
+        elif self._camera is not None and lens is not None and self._camera.fixed_pitch is not None:
+            horizon = self._camera.horizon(lens, height)
         return FrameContext(
             horizon=horizon,
             tracked=self._tracker.curves if is_known else None,
             prior_horizon=None if self._prior_horizon is None or not is_known else self._prior_horizon * height,
         )
 
-    def _update_horizon(self, detections: Detections) -> None:
+    def _update_horizon(self, detections: Detections, is_cut: bool) -> None:
         """Updates the horizon with a weighted mean of the frames' horizons that forgets old frames slowly."""
         view = detections.view
         size = view.width, view.height
         if self._size not in (None, size):
-            self._tracker = LaneTracker()
+            self._tracker = LaneTracker(self._single_image)
+            self._departure.state = DepartureState()
+        if self._size not in (None, size) or is_cut:
             self._horizon, self._evidence = None, 0.0
         self._size = size
         prior_horizon = detections.prior_horizon
@@ -127,6 +248,20 @@ class Session:
         self._evidence += weight
         gain = max(_HORIZON_GAIN * weight, weight / max(self._evidence, 1e-6))
         self._horizon = share if self._horizon is None else self._horizon + gain * (share - self._horizon)
+
+
+def _with_meters(
+    result: FrameResult, calibrator: Calibrator, lens: Lens, bottom: float, timestamp: float, speed: float | None
+) -> FrameResult:
+    """Adds meters to a result in pixels of `lens`, and the camera's direction if it is to be estimated."""
+    result = with_meters(result, calibrator.camera, lens, calibrator.yaw, bottom)
+    if not calibrator.camera.calibrates:
+        return result
+    event = None
+    if result.road is not None and any(lane.state == "detected" for lane in result.lanes):
+        event = calibrator.update(result.road, result.horizon, lens, timestamp, speed)
+    events = result.events if event is None else (*result.events, event)
+    return replace(result, calibration=calibrator.result, events=events)
 
 
 class _TimedInference:

@@ -28,6 +28,7 @@ from lanestream.inference.providers import AUTO, PROVIDER_NAMES, RuntimeOptions
 from lanestream.keys import ApiKey, parse_keys
 from lanestream.streaming.session_registry import SessionLimits
 from lanestream.streaming.stream_protocol import StreamLimits
+from lanestream.tracking.departure import DepartureSettings
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -192,6 +193,28 @@ class Settings(BaseSettings):
     )
     opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV uses for one image.")
 
+    camera: Path | None = Field(
+        default=None, description="Camera file for streams and images that send no camera; without it, none is assumed."
+    )
+    departure_vehicle_width: float = Field(
+        default=DepartureSettings.vehicle_width,
+        ge=0.5,
+        le=4.0,
+        description="Width of a vehicle in meters, over the outer edges of its wheels, if `start` does not say it.",
+    )
+    departure_warning_s: float = Field(
+        default=DepartureSettings.warning_s,
+        ge=0.0,
+        le=5.0,
+        description="A lane departure warning comes this many seconds before the wheels cross a line.",
+    )
+    departure_least_speed: float = Field(
+        default=DepartureSettings.least_speed,
+        ge=0.0,
+        le=150.0,
+        description="Below this speed in m/s, if a vehicle reports it, no lane departure warning comes.",
+    )
+
     api_keys: Annotated[tuple[ApiKey, ...], NoDecode, BeforeValidator(_keys)] = Field(
         default=(),
         description="API keys as printed by `lanestream key NAME`, NAME:SHA256; without any, every caller is accepted.",
@@ -277,6 +300,11 @@ class Settings(BaseSettings):
             handshake_s=self.handshake_s,
             idle_s=self.idle_s,
         )
+
+    @property
+    def departure_settings(self) -> DepartureSettings:
+        """When to warn of lane departures, unless a stream says otherwise."""
+        return DepartureSettings(self.departure_vehicle_width, self.departure_warning_s, self.departure_least_speed)
 
     @property
     def image_limits(self) -> ImageLimits:

@@ -23,7 +23,8 @@ from lanestream import cli
 from lanestream.api.server import listen
 from lanestream.engine import Engine
 from lanestream.errors import UnauthorizedError
-from lanestream.local import LocalEngine
+from lanestream.local import LocalCamera, LocalEngine
+from lanestream.protocol import DepartureEventModel, LanesMessage, SummaryMessage, warning_message
 from lanestream_client.sinks import video_sink
 
 Run = Callable[..., tuple[int, str, str]]
@@ -124,6 +125,48 @@ def test_stream_through_a_service(run: Run, clip: Path, url: str, mode: str) -> 
     assert code == 0
     assert "10 frames: 10 answered" in output
     assert "model fake 1 on cpu" in output
+
+
+def departing(seq: int) -> LanesMessage:
+    """Returns the message for a frame, with a departure event in the sixth."""
+    event = DepartureEventModel(state="warning", side="left", track_id=1, timestamp=0.2)
+    return fakes.lanes(seq).model_copy(update={"timestamp": seq / 25.0, "events": [event] if seq == 5 else []})
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_departures_are_recorded(run: Run, clip: Path, monkeypatch: pytest.MonkeyPatch, remote: bool) -> None:
+    def answering(connection: ScriptedConnection) -> None:
+        connection.open()
+        while (seq := connection.receive_frame()) >= 0:
+            connection.send(departing(seq))
+        connection.send(SummaryMessage(frames=10, answered=10, failed=0, dropped=0, duration_s=0.4))
+
+    monkeypatch.setattr(LocalCamera, "lanes", lambda _self, _image, seq, **_: departing(seq))
+    camera = ["--camera-height", 1.4, "--field-of-view", 62]
+    with scripted(*[answering] * remote) as script:
+        where = ["--url", script.url] if remote else []
+        code, output, errors = run("stream", clip, *camera, "--record-departures", 0.1, *where)
+    assert (code, errors) == (0, "")
+    assert output.splitlines()[-1] == "departure: departures/departure-000005-left.mp4"
+    assert [line["seq"] for line in read_lines(Path("departures/departure-000005-left.jsonl"))] == [3, 4, 5, 6, 7, 8]
+    with av.open("departures/departure-000005-left.mp4") as video:
+        assert len(list(video.decode(video=0))) == 6
+
+
+def test_a_warning_of_the_service_is_printed_once(run: Run, clip: Path) -> None:
+    def warning(connection: ScriptedConnection) -> None:
+        connection.open()
+        connection.send_lanes(connection.receive_frame())
+        connection.send(warning_message("timestamps_not_advancing", 0))
+        connection.finish()
+
+    with scripted(warning) as script:
+        code, _, errors = run("stream", clip, "--url", script.url)
+    assert code == 0
+    assert errors.splitlines() == [
+        "warning: the timestamps of the frames do not advance; send each frame's own capture time, on a clock that does"
+        " not run backwards"
+    ]
 
 
 def test_a_stream_over_replicas_reports_a_lost_connection(run: Run, clip: Path) -> None:
@@ -251,6 +294,7 @@ def test_stream_of_a_folder_names_files_and_continues_after_a_bad_one(run: Run, 
         (["stream", "clip.mp4", "--jsonl", "/dev/null/x.jsonl"], 1, "error: can't write /dev/null/x.jsonl: "),
         (["stream", "clip.mp4", "--url", "x", "--regressor", "none"], 2, "Usage:"),
         (["stream", "clip.mp4", "--mode", "some"], 2, "Usage:"),
+        (["stream", "clip.mp4", "--record-departures", "3"], 2, "Usage:"),
         (["stream", "clip.mp4", "--detector", "unknown"], 2, "Usage:"),
         (["stream", "clip.mp4", "--provider", "tpu"], 2, "Usage:"),
         (["stream"], 2, "Usage:"),

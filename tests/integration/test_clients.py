@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -26,8 +26,8 @@ from lanestream.errors import (
     SourceError,
 )
 from lanestream.local import LocalEngine
-from lanestream.protocol import LanesMessage
-from lanestream_client import AsyncLaneClient, LaneClient, SourceFrame
+from lanestream.protocol import CameraModel, DepartureEventModel, DepartureOptions, LanesMessage
+from lanestream_client import AsyncLaneClient, LaneClient, SourceFrame, StreamResult
 from lanestream_client.in_process import InProcessClient
 from lanestream_client.requests import ServiceInfo
 
@@ -198,6 +198,47 @@ def test_the_detector_can_be_chosen_in_process() -> None:
     one_detector = InProcessClient(LocalEngine(fakes.engine()))
     with pytest.raises(NoDetectorError, match="ask for candidates"):
         one_detector.stream(frames(1), detector="regression")
+
+
+def drifting_frames() -> Iterator[SourceFrame]:
+    """Frames for `fakes.drifting_engine`, of a vehicle that is slower than departure warnings are for by default."""
+    data = fakes.image_file()
+    return (SourceFrame(seq, 0.04 * seq, data=data, speed=10.0, indicator="off") for seq in range(80))
+
+
+def departures(results: Iterable[StreamResult]) -> list[str]:
+    events = [event for result in results if result.lanes is not None for event in result.lanes.events]
+    return [event.state for event in events if isinstance(event, DepartureEventModel)]
+
+
+async def test_departures_are_watched_as_the_client_asks(serve: Serve) -> None:
+    camera, asked = CameraModel(height=1.4, field_of_view=62.0), DepartureOptions(least_speed=5.0)
+    for options, expected in ((None, []), (asked, ["warning", "crossed"])):
+        local = InProcessClient(LocalEngine(fakes.drifting_engine()))
+        assert departures(local.stream(drifting_frames(), camera=camera, departure=options)) == expected
+        with LaneClient(serve(fakes.drifting_engine())) as client:
+            results = client.stream(drifting_frames(), mode="all", camera=camera, departure=options)
+            assert departures(results) == expected
+        async with AsyncLaneClient(serve(fakes.drifting_engine())) as async_client:
+            stream = async_client.stream(drifting_frames(), mode="all", camera=camera, departure=options)
+            assert departures([result async for result in stream]) == expected
+
+
+async def test_the_clients_deliver_warnings(url: str) -> None:
+    def repeated() -> Iterator[SourceFrame]:
+        return (SourceFrame(seq, 1.0, data=fakes.image_file()) for seq in range(5))
+
+    for client in (LaneClient(url), InProcessClient(LocalEngine(fakes.engine()))):
+        stream = client.stream(repeated(), mode="all")
+        assert stream.warnings == ()
+        assert len(list(stream)) == 5
+        assert [(warning.code, warning.seq) for warning in stream.warnings] == [("timestamps_not_advancing", 1)]
+        if isinstance(client, LaneClient):
+            client.close()
+    async with AsyncLaneClient(url) as async_client:
+        async_stream = async_client.stream(repeated(), mode="all")
+        assert len([result async for result in async_stream]) == 5
+        assert [warning.code for warning in async_stream.warnings] == ["timestamps_not_advancing"]
 
 
 async def test_the_async_client_gives_the_same_results(url: str, tmp_path: Path) -> None:

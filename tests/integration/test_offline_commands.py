@@ -72,6 +72,11 @@ def folder(tmp_path: Path) -> Path:
         ("score empty.jsonl binary", "binary is not a text file"),
         ("score empty.jsonl half.jsonl", "half.jsonl:1: there is no 'lanes'"),
         ("evaluate --data none", "no labels of a known format in none"),
+        ("calibrate missing -o camera.json --height 1.4", "no such file or folder: missing"),
+        ("calibrate none -o camera.json --height 1.4", "no images in the folder none"),
+        ("calibrate text -o camera.json --height 1.4", "text can't be read as a video"),
+        ("calibrate none -o camera.json --camera text", "text: not a valid camera: Invalid JSON"),
+        ("calibrate none -o camera.json --field-of-view 60", "not a valid camera: height: "),
         (
             "train classifier --run run --data none",
             "the data set 'TuSimple 0313-1' is missing: there is nothing at none/tus",

@@ -23,6 +23,8 @@ CHECKS = [
     checks.response_headers_conformance,
 ]
 DOCUMENT = schemathesis.openapi.from_dict(create_app(None, Settings(), draw_lanes).openapi())
+# A parameter that is too long may make the URL too long.
+DOCUMENT.config.checks.negative_data_rejection.expected_statuses = [400, 401, 403, 404, 405, 406, 409, 414, 415, 422]
 OPERATIONS = {result.ok().label: result.ok() for result in DOCUMENT.get_all_operations()}
 DETECT = "POST /v1/detect"
 GENERATED = [(label, GenerationMode.POSITIVE) for label in OPERATIONS] + [(DETECT, GenerationMode.NEGATIVE)]

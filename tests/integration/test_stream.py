@@ -16,6 +16,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from wsclient import receive, receive_close, send_message, stream, wait_until_read, wait_until_released
 
+from lanestream.api import websocket
 from lanestream.detection.interface import Detections, FrameContext, Infer
 from lanestream.errors import WorkerLostError
 from lanestream.road.view import Image
@@ -78,10 +79,68 @@ def test_missing_numbers_and_times_are_assigned(url: str) -> None:
             if announced:
                 send_message(socket, "frame", **announced)
             socket.send(fakes.image_file())
-        answers = [receive(socket) for _ in range(4)]
+        messages = [receive(socket) for _ in range(5)]
+    # The times run backwards, which is warned of.
+    answers = [message for message in messages if message["type"] == "lanes"]
     assert [answer["seq"] for answer in answers] == [0, 7, 8, 3]
     assert [answer["timestamp"] for answer in answers[1:3]] == [3.5, -2.0]
     assert all(0.0 <= answers[i]["timestamp"] < 60.0 for i in (0, 3)), "seconds since the stream was opened"
+
+
+@pytest.mark.parametrize(
+    ("timestamps", "code"),
+    [
+        ([1000.0, 1040.0, 1080.0, 1120.0, 1160.0, 1200.0], "timestamps_in_milliseconds"),
+        ([1.0, 1.0, 1.0, 1.04], "timestamps_not_advancing"),
+        ([2.0, 1.0, 0.5], "timestamps_not_advancing"),
+    ],
+)
+def test_implausible_timestamps_are_warned_of_once(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch, timestamps: list[float], code: str
+) -> None:
+    logged: list[str] = []
+    monkeypatch.setattr(websocket._log, "warning", lambda text, *values, **_: logged.append(text % values))
+    url = serve(fakes.engine())
+    with stream(url, mode="all") as socket:
+        for timestamp in timestamps:
+            send_message(socket, "frame", timestamp=timestamp)
+            socket.send(fakes.image_file())
+        send_message(socket, "end")
+        answers = []
+        while not answers or answers[-1]["type"] != "summary":
+            answers.append(receive(socket))
+    assert [answer["seq"] for answer in answers if answer["type"] == "lanes"] == list(range(len(timestamps)))
+    (warning,) = [answer for answer in answers if answer["type"] == "warning"]
+    assert warning["code"] == code
+    assert logged == [warning["message"]]
+    metrics = httpx.get(f"{url}/metrics").text
+    assert f'lane_timestamp_warnings_total{{code="{code}"}} 1.0' in metrics
+
+
+def test_departures_are_reported_with_a_camera(serve: Serve) -> None:
+    """The vehicle drifts to the right at half a meter per second; the same with its indicator on is intended."""
+    camera = {"height": 1.4, "field_of_view": 62.0}
+    options: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        ({}, {}),
+        ({}, {"speed": 30.0, "indicator": "right"}),
+        ({}, {"speed": 3.0}),
+        ({"least_speed": 2.0}, {"speed": 3.0}),
+    ]
+    warned = []
+    for departure, motion in options:
+        url = serve(fakes.drifting_engine())
+        with stream(url, mode="all", camera=camera, departure=departure) as socket:
+            answers = []
+            for frame in range(80):
+                send_message(socket, "frame", timestamp=0.04 * frame, **motion)
+                socket.send(fakes.image_file())
+                answers.append(receive(socket))
+        assert answers[40]["departure"]["state"] == "none"
+        assert answers[60]["ego"]["lateral_speed"] == pytest.approx(0.5, abs=0.1)
+        events = [event for answer in answers for event in answer["events"] if event["type"] == "departure"]
+        assert {event["side"] for event in events} <= {"right"}
+        warned.append([event["state"] for event in events])
+    assert warned == [["warning", "crossed"], [], [], ["warning", "crossed"]]
 
 
 def test_end_answers_the_frames_held_then_sends_the_summary_and_closes(serve: Serve) -> None:
@@ -144,6 +203,13 @@ BAD_TEXTS = [
     '{"type": "frame", "timestamp": 1e400}',
     '{"type": "frame", "timestamp": 1e300}',
     '{"type": "frame", "timestamp": NaN}',
+    '{"type": "frame", "speed": -1}',
+    '{"type": "frame", "speed": 400}',
+    '{"type": "frame", "speed": NaN}',
+    '{"type": "frame", "indicator": "both"}',
+    '{"type": "start", "departure": {"vehicle_width": 9}}',
+    '{"type": "start", "departure": {"warning_s": -1}}',
+    '{"type": "start", "departure": {"lateness": 1}}',
     "[" * 65_000,
     json.dumps({"type": "start", "a\nkey": 1}),
     json.dumps({"type": "start", "k" * 65_000: 1}),

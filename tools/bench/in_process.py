@@ -24,6 +24,7 @@ from lanestream.engine import Engine, load_engine
 from lanestream.images.decoding import ImageLimits, decode
 from lanestream.local import LocalCamera, LocalEngine
 from lanestream.logs import log_config
+from lanestream.session import SessionOptions
 from lanestream.settings import load_settings
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame
@@ -132,7 +133,7 @@ class InProcessCameras:
         await asyncio.gather(*done)
 
     async def _stream(self, pool: WorkerPool, number: int) -> None:
-        session, seq = pool.open_session(detector=self.request.detector), 0
+        session, seq = pool.open_session(SessionOptions(detector=self.request.detector)), 0
         while True:
             started = time.monotonic()
             async with pool.admit("bench") as slot:

@@ -18,6 +18,7 @@ from lanestream.images.decoding import DecodedImage, ImageLimits, decode_reduced
 from lanestream.inference.batcher import Batcher
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.road.view import WORKING_WIDTH
+from lanestream.session import SessionOptions
 
 # LitServe's documentation uses batches of 8 that wait 50 to 100 ms. A shorter wait is better with few clients.
 MAX_BATCH_SIZE: Final = 8
@@ -50,7 +51,7 @@ class LitServeLaneApi(litserve.LitAPI):  # type: ignore[misc]
         return lanes_message(output, seq=0, timestamp=time.monotonic()).model_dump(mode="json")
 
     def _process(self, image: DecodedImage) -> ProcessedFrame:
-        result = self._engine.open_session().process(image.image, 0.0, self._infer)
+        result = self._engine.open_session(SessionOptions(single_image=True)).process(image.image, 0.0, self._infer)
         return ProcessedFrame.of(image, result, _NO_TIMING)
 
     def _infer(self, role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:

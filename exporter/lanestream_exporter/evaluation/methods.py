@@ -16,6 +16,7 @@ from lanestream.detection.proposals import MOST_CANDIDATES
 from lanestream.engine import Engine
 from lanestream.road.results import FrameResult
 from lanestream.road.view import Image
+from lanestream.session import SessionOptions
 from lanestream_exporter.datasets.labels import LabeledFrame, to_working
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
 from lanestream_exporter.evaluation.outcomes import MOST_RANKED, FrameEvaluation, JudgedCandidates, judge
@@ -71,8 +72,9 @@ class ServedModel:
         self.regressor = engine.models["regressor"].name if has_prior else None
 
     def detect(self, image: Image, frame: LabeledFrame) -> FrameEvaluation:
-        """Evaluates a single image as the first frame of a new session."""
-        reports = _reports(self._engine.process(self._engine.open_session(), image, 0.0))
+        """Evaluates a single image."""
+        session = self._engine.open_session(SessionOptions(single_image=True))
+        reports = _reports(self._engine.process(session, image, 0.0))
         candidates = None if self._candidates is None else self._judge(self._candidates, *to_working(frame, image))
         return FrameEvaluation(frame, reports, candidates)
 

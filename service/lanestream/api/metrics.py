@@ -23,10 +23,12 @@ from lanestream.errors import (
     OverrunError,
     RateError,
 )
+from lanestream.protocol import WARNINGS
 from lanestream.workers.pool import WorkerEvent
 
 if TYPE_CHECKING:
     from lanestream.inference.batcher import BatchReport
+    from lanestream.protocol import WarningCode
     from lanestream.workers.capabilities import DetectorInfo
 
 DropReason = Literal["superseded", "expired", "overload", "decode_error", "too_large", "rate", "disconnected", "error"]
@@ -69,6 +71,9 @@ class Metrics:
             "lane_frames_dropped_total", "Frames received and not answered with lanes.", "reason"
         )
         self._refusals = self._counter("lane_refusals_total", "Errors sent to clients.", "code")
+        self._timestamp_warnings = self._counter(
+            "lane_timestamp_warnings_total", "Sessions whose frames had implausible timestamps.", "code"
+        )
         self._resumed = self._counter("lane_sessions_resumed_total", "Attempts to resume a session.", "result")
         self._closes = self._counter("lane_ws_closes_total", "WebSockets closed, by close code.", "code")
         self._cuts = self._counter(
@@ -121,6 +126,8 @@ class Metrics:
             self._resumed.labels(result)
         for cut in CUT_REASONS:
             self._cuts.labels(cut)
+        for code in WARNINGS:
+            self._timestamp_warnings.labels(code)
         for event in get_args(WorkerEvent):
             self._worker_events.labels(event)
 
@@ -190,6 +197,10 @@ class Metrics:
     def refused(self, code: str) -> None:
         """Counts an error sent to a client."""
         self._refusals.labels(code).inc()
+
+    def timestamp_warning(self, code: WarningCode) -> None:
+        """Counts a warning sent to a client because of its timestamps."""
+        self._timestamp_warnings.labels(code).inc()
 
     def loaded(self, info: DetectorInfo) -> None:
         """Reports a detector that is ready, and its network."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
@@ -24,6 +25,7 @@ from lanestream.protocol import (
     DetectorName,
     FieldOfView,
     LanesMessage,
+    StartMessage,
     parse_camera,
 )
 from lanestream.streaming.session_registry import Caller
@@ -46,6 +48,7 @@ metrics_router = APIRouter()
 
 _JSON: Final = "application/json"
 _PART_BYTES: Final = 1 << 16
+_MOST_CAMERA_CHARACTERS: Final = 2048
 _PICTURES: Final = {"image/jpeg": ".jpg", "image/png": ".png"}
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["schema"]}, "required": ["file"]}}
@@ -94,6 +97,7 @@ _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     406: {"model": Problem, "description": "No accepted media type is available"},
     408: {"model": Problem, "description": "The body took too long to arrive"},
     413: {"model": Problem, "description": "The image has too many bytes or pixels"},
+    414: {"model": Problem, "description": "The URL is too long"},
     415: {"model": Problem, "description": "The body is not an image, or a corrupt one"},
     422: {"model": Problem, "description": "The request is malformed, or the detector is not loaded"},
     503: {"model": Problem, "description": "The service is not ready, or at its session limit"},
@@ -138,9 +142,13 @@ def _camera(
         CameraHeight | None, Query(description="Height of the camera in meters; adds coordinates in meters.")
     ] = None,
     field_of_view: Annotated[FieldOfView | None, Query(description="Horizontal field of view in degrees.")] = None,
+    camera: Annotated[
+        str | None,
+        Query(max_length=_MOST_CAMERA_CHARACTERS, description="The whole camera as JSON, instead of the two above."),
+    ] = None,
 ) -> CameraModel | None:
-    """Returns the camera of a request. Raises ProtocolError if only one parameter is given."""
-    return parse_camera(camera_height, field_of_view)
+    """Returns the camera of a request. Raises ProtocolError if it is not complete or not valid."""
+    return parse_camera(camera_height, field_of_view, camera)
 
 
 @router.post(
@@ -177,12 +185,14 @@ async def detect(
     media_type = _response_media_type(request, service)
     # Requests that fail anyway are refused before their body is read, and a slow body does not occupy a session.
     pool.capabilities.select(detector)
+    start = StartMessage(horizon=horizon, detector=detector, camera=camera)
+    options = replace(service.session_options(start), single_image=True)
     service.sessions.check_limits(caller)
     with service.answering(request, caller):
         async with service.bodies.image(request, caller.quota) as data:
-            with service.sessions.temporary(pool, caller, horizon, detector) as session:
+            with service.sessions.temporary(pool, caller, options) as session:
                 frame = await _process(service, session, caller, data)
-                message = lanes_message(frame, seq=0, timestamp=0.0, camera=camera)
+                message = lanes_message(frame, seq=0, timestamp=0.0)
                 if media_type == _JSON:
                     return Response(message.model_dump_json(), media_type=_JSON)
                 async with pool.admit(caller.quota) as slot:

@@ -18,14 +18,15 @@ from lanestream.api.metrics import Metrics
 from lanestream.api.request_body import BodyLimits, BodyReader
 from lanestream.asyncapi import document
 from lanestream.errors import DrainingError, NotReadyError
-from lanestream.protocol import Limits, json_schemas
+from lanestream.protocol import Limits, json_schemas, read_camera_file
+from lanestream.session import SessionOptions
 from lanestream.streaming.session_registry import SessionRegistry
 from lanestream.streaming.stores import open_store
 
 if TYPE_CHECKING:
     from starlette.requests import HTTPConnection
 
-    from lanestream.protocol import LanesMessage
+    from lanestream.protocol import LanesMessage, StartMessage
     from lanestream.road.view import Image
     from lanestream.settings import Settings
     from lanestream.streaming.session_registry import Caller
@@ -60,6 +61,7 @@ class Service:
         self.settings = settings
         self.draw = draw
         self.authenticator = Authenticator.from_settings(settings)
+        self._camera = None if settings.camera is None else read_camera_file(settings.camera)
         self.metrics = Metrics()
         self.budget = ByteBudget(settings.buffered_bytes)
         self.proxies = os.environ.get(_PROXIES_VARIABLE, "")
@@ -111,6 +113,16 @@ class Service:
         """Raises NotReadyError if worker processes that end are no longer replaced."""
         if self._pool is not None and self._pool.upkeep_failed:
             raise NotReadyError("worker processes are no longer replaced", "restart the service; its log has the cause")
+
+    def session_options(self, message: StartMessage) -> SessionOptions:
+        """Returns the options of the session that `message` opens. Raises ProtocolError if they are contradictory."""
+        camera = message.camera or self._camera
+        if message.camera is None and camera is not None and message.horizon is not None:
+            # The client's own horizon counts more than the pitch of the service's default camera.
+            camera = camera.model_copy(update={"pitch": None})
+        return SessionOptions.of(
+            message.horizon, message.detector, camera, message.departure, self.settings.departure_settings
+        )
 
     def install(self, pool: WorkerPool) -> None:
         """Makes the service ready with a warm worker pool."""

@@ -29,6 +29,7 @@ from lanestream.errors import (
 from lanestream.messages import lanes_message
 from lanestream.protocol import (
     SUBPROTOCOL,
+    WARNINGS,
     ErrorMessage,
     ReadyMessage,
     ServerMessage,
@@ -40,8 +41,11 @@ from lanestream.streaming.stream_protocol import FrameOutcome, StreamProtocol, S
 from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lanestream.api.service import Service
     from lanestream.messages import ProcessedFrame
+    from lanestream.protocol import WarningCode
     from lanestream.streaming.session_registry import Caller, OpenSession
     from lanestream.streaming.stream_protocol import IncomingFrame
     from lanestream.workers.admission import Slot
@@ -172,11 +176,12 @@ class StreamConnection:
         return None
 
     async def _start(self, message: StartMessage, now: float) -> None:
-        # Checked first, so that asking for a detector that is not loaded leaves the stream unchanged.
+        # Checked first, so that options that can't be had leave the stream unchanged.
         detector = self._service.pool.capabilities.select(message.detector)
+        options = self._service.session_options(message)
         self._service.check_ready()
         self._protocol.receive_start(message, now)
-        session = await self._service.sessions.start(self._service.pool, self._caller, message)
+        session = await self._service.sessions.start(self._service.pool, self._caller, message, options)
         self._attach(session)
         if session.resume_outcome is not None:
             self._service.metrics.session_resumed(session.resume_outcome)
@@ -200,7 +205,8 @@ class StreamConnection:
     def _ensure_session(self) -> OpenSession:
         """Returns the stream's session. Without `start`, opens one that can't be resumed: the client has no token."""
         if self._session is None:
-            self._attach(self._service.sessions.open(self._service.pool, self._caller))
+            options = self._service.session_options(self._protocol.options)
+            self._attach(self._service.sessions.open(self._service.pool, self._caller, options))
         assert self._session is not None  # noqa: S101 - attached above
         return self._session
 
@@ -226,6 +232,7 @@ class StreamConnection:
         while not self._protocol.finished:
             if self._protocol.has_waiting_frame:
                 await self._send(await self._answer_next())
+                await self._send_pending()
                 continue
             self._received.clear()
             await self._received.wait()
@@ -267,13 +274,19 @@ class StreamConnection:
         self._complete(session, FrameOutcome.ANSWERED)
         timing = processed.result.timing_ms
         self._service.metrics.frame_processed(timing, 1e-3 * timing["total"])
+        self._warn(processed.result.warnings, frame.seq)
         return lanes_message(
             processed,
             seq=frame.seq,
             timestamp=frame.timestamp,
             dropped=self._protocol.dropped,
-            camera=self._protocol.options.camera,
         )
+
+    def _warn(self, codes: Sequence[WarningCode], seq: int) -> None:
+        for code in codes:
+            self._protocol.warn(code, seq)
+            self._service.metrics.timestamp_warning(code)
+            _log.warning("%s", WARNINGS[code][0], extra=self._log_fields(seq))
 
     def _check_worker_losses(self, error: Exception) -> None:
         """Raises the error, which ends the stream for good, if the stream's frames have cost several workers."""
@@ -292,7 +305,7 @@ class StreamConnection:
         session.processing = True
         async with admission:
             try:
-                encoded = EncodedFrame(frame.data, frame.timestamp, frame.arrived, frame.deadline)
+                encoded = EncodedFrame(frame.data, frame.timestamp, frame.arrived, frame.deadline, frame.motion)
                 processed = await self._service.pool.run(session.handle, encoded, slot)
                 session.last_seq, session.stream_s = frame.seq, self._protocol.stream_s(time.monotonic())
                 return processed

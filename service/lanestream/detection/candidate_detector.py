@@ -105,8 +105,18 @@ class CandidateDetector:
         means = _means(curves, own[accepted], gaps, chosen, proposals.view)
         fits = fit_curves(gray, means, spans.take(chosen), proposals.view)
         visible = visible_spans(fits.curves, fits.view)
+        prior = proposals.prior
+        expected = np.zeros(len(chosen), bool) if prior is None else prior.expects(curves.take(chosen))
         detections = [
-            Detection(fits.curves[i], fits.covariances[i], float(visible.top[i]), float(visible.bottom[i]), p)
+            Detection(
+                fits.curves[i],
+                fits.covariances[i],
+                float(visible.top[i]),
+                float(visible.bottom[i]),
+                p,
+                float(fits.paint[i]),
+                expected=bool(expected[i]),
+            )
             for i, p in enumerate(probability[accepted[chosen]].tolist())
             if visible.visible[i]
         ]

@@ -10,7 +10,7 @@ the middle between both stripes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Final
 
@@ -73,10 +73,14 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Fits:
-    """Fitted curves, the covariances (N, 3, 3) of their coefficients, and the view with the horizon they agree on."""
+    """Fitted curves, the covariances (N, 3, 3) of their coefficients, and the view with the horizon they agree on.
+
+    `paint` (N,) is the share of each curve's rows in which it lies on a marking.
+    """
 
     curves: Curves
     covariances: FloatArray
+    paint: FloatArray
     view: RoadView
 
 
@@ -94,7 +98,7 @@ def fit_curves(
     `sigma` (N, 3) are the deviations in pixels of the curves' columns at the `anchors`, if known.
     """
     if not len(curves):
-        return Fits(curves, np.empty((0, 3, 3)), view)
+        return Fits(curves, np.empty((0, 3, 3)), np.empty(0), view)
     visible = visible_spans(curves, view, _TOP_SHARE)
     top = np.where(visible.visible, visible.top, spans.top)
     bottom = np.where(visible.visible, visible.bottom, spans.bottom)
@@ -103,7 +107,7 @@ def fit_curves(
     if sigma is None:
         sigma = strips.obliquity[:, None] * _CANDIDATE_SIGMA * view.depth
     fits = _JointFit(strips, bars, curves, view, sigma, anchors).run(settings)
-    return Fits(_between_stripes(gray, fits, top, bottom), fits.covariances, fits.view)
+    return replace(fits, curves=_between_stripes(gray, fits, top, bottom))
 
 
 @dataclass(frozen=True)
@@ -214,7 +218,7 @@ class _JointFit:
         road = np.array([_median(start[:, 0]), 0.0, _median(start[:, 2])])
         for reach in settings.rounds:
             row_basis = _basis((self._strips.y - horizon) / depth)
-            information, moment = self._paint(row_basis, start, theta, reach, horizon)
+            information, moment, paint = self._paint(row_basis, start, theta, reach, horizon)
             prior = (basis.T * self._precision[:, None, :]) @ basis
             known = np.array([_median(start[:, 0]), expected - horizon, _median(start[:, 2])])
             constraints, weights = self._weighted_constraints(inverse, theta, road, horizon)
@@ -238,12 +242,16 @@ class _JointFit:
         covariance = _inverse(normal).ravel()[self._blocks]
         # From v, b, c in terms of t to v, b, k in terms of u.
         unit = np.array([1.0, 1.0 / depth, depth])
-        return Fits(Curves(horizon, theta * unit), covariance * np.outer(unit, unit), self._view.with_horizon(horizon))
+        fitted = Curves(horizon, theta * unit)
+        return Fits(fitted, covariance * np.outer(unit, unit), paint, self._view.with_horizon(horizon))
 
     def _paint(
         self, row_basis: FloatArray, start: FloatArray, theta: FloatArray, reach: float, horizon: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Returns normal equations (N, 3, 3) and (N, 3) of the shifts, from the bars near the curves `theta` (N, 3)."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Returns normal equations (N, 3, 3) and (N, 3) of the shifts, from the bars near the curves `theta` (N, 3).
+
+        The third value is the share (N,) of rows with a bar.
+        """
         strips = self._strips
         both = row_basis @ np.stack([theta, start], axis=2)
         position = ((both[:, :, 0] - strips.x) / self._scale).astype(np.float32)
@@ -257,9 +265,11 @@ class _JointFit:
         residual = strips.x + moment / np.maximum(total, 1e-6) * self._scale - both[:, :, 1]
         # A row counts once, however wide its bar; a row without a bar does not count.
         is_near = strips.y - horizon > _FARTHEST * self._view.depth
-        precision = np.minimum(0.5 * total, 1.0) * is_near * self._row_precision
+        presence = np.minimum(0.5 * total, 1.0) * is_near
+        paint = presence.sum(axis=1) / np.maximum(is_near.sum(axis=1), 1)
+        precision = presence * self._row_precision
         weighted = (row_basis * precision[:, :, None]).swapaxes(1, 2)
-        return weighted @ row_basis, (weighted @ residual[:, :, None])[:, :, 0]
+        return weighted @ row_basis, (weighted @ residual[:, :, None])[:, :, 0], paint
 
     def _weighted_constraints(
         self, inverse: FloatArray, theta: FloatArray, road: FloatArray, horizon: float

@@ -33,6 +33,9 @@ _UNCERTAIN: Final = 0.022
 _MOST_UNCERTAIN: Final = 0.1
 # Lateral positions are compared at these anchors: farther away all lines of a road are close together.
 _COMPARED: Final = REGRESSOR_ANCHORS[:2]
+# A curve within the second distance, in row offsets, of a boundary with at least the first presence is that boundary.
+_LIKELY: Final = 0.5
+_EXPECTED: Final = 0.16
 # The smallest sigma of a boundary, in row offsets.
 _LEAST_SIGMA: Final = 0.02
 # The odds factor of a line a whole number of lane widths from the ego lane, and the share of it for a line far from
@@ -118,6 +121,14 @@ class EgoPrior:
         left = at[-1] if -1 in at else at[1] - USUAL_LANE_WIDTH
         right = at[1] if 1 in at else at[-1] + USUAL_LANE_WIDTH
         return LaneSpacing(left, right, least)
+
+    def expects(self, curves: Curves) -> NDArray[np.bool_]:
+        """Returns for each of the `curves` (N,) whether it is one of the prior's boundaries."""
+        below = _COMPARED * self.view.depth
+        rows = self.view.horizon + below
+        apart = np.abs(curves.x(rows)[:, None] - self.curves.x(rows)) / below
+        likely = self.presence >= _LIKELY
+        return np.asarray((apart[:, likely].mean(axis=2) <= _EXPECTED).any(axis=1))
 
     def odds(self, curves: Curves) -> FloatArray:
         """Returns the factors (N,) by which their positions change the odds of `curves` to be boundaries.

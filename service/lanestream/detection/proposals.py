@@ -24,7 +24,7 @@ from lanestream.detection.vanishing_point import (
 from lanestream.road.curve import Curves, FloatArray, VanishingPoint
 from lanestream.road.view import Image, RoadView, Spans, visible_spans
 
-# The most candidates of a frame, and of one in which boundaries are tracked: those come first, so fewer are needed.
+# The most candidates of a frame, and of one in which boundaries are tracked: those come early, so fewer are needed.
 MOST_CANDIDATES: Final = 16
 MOST_WITH_TRACKS: Final = 12
 
@@ -67,7 +67,7 @@ def propose(
 ) -> Proposals:
     """Returns the candidates of a gray working image (H, 640).
 
-    Tracked boundaries come first, then the boundaries of the `prior` and the next lanes beside them, the prior's
+    The boundaries of the `prior` and the next lanes beside them come first, then tracked boundaries, the prior's
     boundaries after a fit to their paint (`on_paint`), and the lines found in the image, strongest first.
     """
     height, width = gray.shape
@@ -77,13 +77,15 @@ def propose(
     lines = find_lines(road.ridges, point, width)
     found, strength = point.curves(lines.positions), _normalized(lines.strength)
     tracked = (context.tracked or Curves.none(point.y)).below(point.y, view.bottom)
-    leading = [tracked]
+    leading = []
     if prior is not None and prior.sides:
         own = prior.curves.below(point.y, view.bottom)
         bottom = np.array([view.bottom])
         spacing = prior.spacing(point.positions(own.x(bottom)[:, 0], bottom), _UNSPACED_SHARE)
         strength = strength * spacing.weight(lines.positions)
-        leading += [own, point.curves(spacing.neighbors)]
+        leading = [own, point.curves(spacing.neighbors)]
+    # A tracked boundary is where it was a frame ago, so it comes after what this frame shows.
+    leading.append(tracked)
     if road.hough is not None:
         curves, votes = hough_curves(road.hough, point, view)
         found = Curves.concatenate([found, curves])

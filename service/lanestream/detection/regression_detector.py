@@ -42,6 +42,8 @@ class RegressionDetector:
                 float(spans.top[index]),
                 float(spans.bottom[index]),
                 float(output.presence[side]),
+                float(fits.paint[index]),
+                expected=True,
             )
             for index, side in enumerate(sides)
             if spans.visible[index]

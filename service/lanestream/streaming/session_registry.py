@@ -10,16 +10,17 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from lanestream.errors import BusyError, EvictedError, StoreError, TooOldError
+from lanestream.session import DEFAULT_SESSION, SessionOptions
 from lanestream.streaming.record import SessionRecord
 from lanestream.streaming.store import SessionStore, StoredSession
 from lanestream.streaming.token_bucket import TokenBuckets
 
 if TYPE_CHECKING:
-    from lanestream.protocol import DetectorName, StartMessage
+    from lanestream.protocol import StartMessage
     from lanestream.streaming.store import TakenSession
     from lanestream.workers.pool import SessionHandle, WorkerPool
 
@@ -193,35 +194,36 @@ class SessionRegistry:
         self,
         pool: WorkerPool,
         caller: Caller,
-        horizon: float | None = None,
-        detector: DetectorName | None = None,
+        options: SessionOptions = DEFAULT_SESSION,
         name: str | None = None,
     ) -> OpenSession:
-        """Opens a session that can't be resumed. `horizon` is a fraction of the image height.
+        """Opens a session that can't be resumed.
 
-        Raises BusyError at a limit, and NoDetectorError if `detector` is not loaded.
+        Raises BusyError at a limit, and NoDetectorError if the requested detector is not loaded.
         """
         self.check_limits(caller)
         bucket = self._opens.bucket(caller.quota, self._clock())
         if not bucket.covers(1.0, self._clock()):
             raise BusyError(f"you opened more than {_OPENS_PER_S:g} sessions per second", "try again in a second")
-        session = self._add(pool, caller, horizon, detector, name)
+        session = self._add(pool, caller, options, name)
         bucket.spend(1.0)
         return session
 
     @contextmanager
     def temporary(
-        self, pool: WorkerPool, caller: Caller, horizon: float | None = None, detector: DetectorName | None = None
+        self, pool: WorkerPool, caller: Caller, options: SessionOptions = DEFAULT_SESSION
     ) -> Iterator[OpenSession]:
-        """Opens a session for the duration of a `with` block. Raises BusyError and NoDetectorError."""
+        """Opens a session for one image, for the duration of a `with` block. Raises BusyError and NoDetectorError."""
         self.check_limits(caller)
-        session = self._add(pool, caller, horizon, detector)
+        session = self._add(pool, caller, replace(options, single_image=True))
         try:
             yield session
         finally:
             self._open.discard(session)
 
-    async def start(self, pool: WorkerPool, caller: Caller, message: StartMessage) -> OpenSession:
+    async def start(
+        self, pool: WorkerPool, caller: Caller, message: StartMessage, options: SessionOptions = DEFAULT_SESSION
+    ) -> OpenSession:
         """Resumes the session of the message's token if it still exists and belongs to `caller`; else opens a new one.
 
         Of several sockets that resume one session at the same time, the latest gets it. Raises EvictedError for the
@@ -230,11 +232,11 @@ class SessionRegistry:
         if self._store.shared and self._renewal is None:
             self._renewal = asyncio.create_task(self._renew())
         if message.resume_token is None:
-            session = self.open(pool, caller, message.horizon, message.detector, message.session)
+            session = self.open(pool, caller, options, message.session)
             return await self._begin(session, _Turn())
         async with self._turn(caller, message.resume_token) as turn:
             turn.check_latest()
-            session = await self._resume(pool, caller, message, message.resume_token)
+            session = await self._resume(pool, caller, message, options, message.resume_token)
             return await self._begin(session, turn)
 
     def schedule_save(self, session: OpenSession) -> None:
@@ -273,15 +275,8 @@ class SessionRegistry:
             self._renewal.cancel()
             await asyncio.wait([self._renewal])
 
-    def _add(
-        self,
-        pool: WorkerPool,
-        caller: Caller,
-        horizon: float | None,
-        detector: DetectorName | None,
-        name: str | None = None,
-    ) -> OpenSession:
-        handle, now = pool.open_session(horizon, detector), self._clock()
+    def _add(self, pool: WorkerPool, caller: Caller, options: SessionOptions, name: str | None = None) -> OpenSession:
+        handle, now = pool.open_session(options), self._clock()
         session = OpenSession(name or secrets.token_hex(8), handle, caller, self._clock, born=now, stream_began=now)
         self._open.add(session)
         return session
@@ -307,17 +302,19 @@ class SessionRegistry:
             if turn.sockets == 0:
                 del self._turns[name]
 
-    async def _resume(self, pool: WorkerPool, caller: Caller, message: StartMessage, token: str) -> OpenSession:
+    async def _resume(
+        self, pool: WorkerPool, caller: Caller, message: StartMessage, options: SessionOptions, token: str
+    ) -> OpenSession:
         """Returns the session of `token`, or a new one if it can't be resumed."""
         owner = secrets.token_hex(8)
         taken = await self._take_over(token, caller, owner)
         record = None if taken is None else self._read(taken.data)
         if taken is None or record is None:
-            session = self.open(pool, caller, message.horizon, message.detector, message.session)
+            session = self.open(pool, caller, options, message.session)
             session.resume_outcome = "unknown"
             return session
         self.check_limits(caller)
-        session = self._add(pool, caller, message.horizon, message.detector, message.session)
+        session = self._add(pool, caller, options, message.session)
         session.owner = owner
         if self._restore(session, record, 0 if record.clean and taken.latest else _UNSAVED_IDS):
             session.token, session.resume_outcome = token, "resumed"

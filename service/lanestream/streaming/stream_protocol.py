@@ -19,9 +19,12 @@ from lanestream.protocol import (
     ServerMessage,
     StartMessage,
     SummaryMessage,
+    WarningCode,
     error_message,
+    warning_message,
 )
 from lanestream.streaming.token_bucket import TokenBucket
+from lanestream.tracking.departure import VehicleMotion
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class IncomingFrame:
     """A received frame: its number, capture time in seconds, image file and arrival time (monotonic seconds).
 
     After `deadline` its lanes are no longer useful. A frame with a `refusal` is answered with that error, and its image
-    is discarded.
+    is discarded. `motion` is what the vehicle reported with it.
     """
 
     seq: int
@@ -56,6 +59,7 @@ class IncomingFrame:
     arrived: float
     deadline: float | None = None
     refusal: LanestreamError | None = None
+    motion: VehicleMotion = VehicleMotion()
 
 
 class StreamState(Enum):
@@ -225,6 +229,10 @@ class StreamProtocol:
             self._state = StreamState.DRAINING
         self._outgoing.append(DrainingMessage(resume_token=resume_token, deadline_s=deadline_s))
 
+    def warn(self, code: WarningCode, seq: int) -> None:
+        """Warns the client of something that the frame `seq` showed."""
+        self._outgoing.append(warning_message(code, seq))
+
     def request_slot(self) -> None:
         """Notes that the next frame waits for other streams; until `take_frame` a newer frame may replace it."""
         self._slot_requested = True
@@ -322,4 +330,5 @@ class StreamProtocol:
         timestamp = self.stream_s(now) if announced.timestamp is None else announced.timestamp
         self._next_seq = seq + 1
         deadline = now + self._limits.frame_deadline_s if self.mode == "latest" else None
-        return IncomingFrame(seq, timestamp, b"" if refusal else data, now, deadline, refusal)
+        motion = VehicleMotion(announced.speed, announced.indicator)
+        return IncomingFrame(seq, timestamp, b"" if refusal else data, now, deadline, refusal, motion)

@@ -1,21 +1,20 @@
-"""The ego lane: its width, the positions of boundaries relative to the camera, and lane changes."""
+"""The ego lane: its width, the positions of boundaries relative to the vehicle, and lane changes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final
 
-from lanestream.road.results import LaneChange
 from lanestream.road.view import LANE_WIDTHS
 from lanestream.tracking.tracks import Track
 
 # How quickly the lane width follows that of a frame.
 _WIDTH_GAIN: Final = 0.05
-# A boundary has changed sides after this many frames at least this many lane widths beyond the camera.
-_CROSSING_MARGIN: Final = 0.1
-_CROSSING_FRAMES: Final = 3
-# A gap of more lane widths than this counts as two lanes. The camera may be anywhere in its lane, so the first boundary
-# is up to a whole lane width away.
+# A boundary has changed sides this many lane widths beyond the middle of the vehicle: the first if the vehicle moves
+# towards that side by at least this many lane widths per second, or else the second.
+_MOVING_MARGIN, _MOVING, _MARGIN = 0.01, 0.1, 0.1
+# A gap of more lane widths than this counts as two lanes. The vehicle may be anywhere in its lane, so the first
+# boundary is up to a whole lane width away.
 _FIRST_GAP: Final = 1.3
 _NEXT_GAP: Final = 1.6
 
@@ -26,33 +25,36 @@ def learned_width(width: float, measured: float) -> float:
     return width + _WIDTH_GAIN * (measured - width) if narrowest <= measured <= widest else width
 
 
-def lane_change(track: Track, column: float, camera: float, lane_width: float) -> LaneChange | None:
-    """Records a track's `column` at the bottom row; returns a lane change if the track has just changed sides.
+def has_changed_sides(
+    track: Track, place: float, sideways: float, lane_width: float, earlier: float, now: float
+) -> bool:
+    """Records where a boundary is at the time `now`; returns whether it has changed sides of the vehicle.
 
-    `camera` is the camera's column, `lane_width` is in pixels at that row.
+    `place` and `lane_width` are in row offsets, `place` from the vehicle's middle; `sideways` is the speed at which the
+    vehicle moves to the right, in row offsets per second. The last frame was at the time `earlier`. The track's
+    `crossed` is then the time of the crossing, interpolated between frames.
     """
-    if (column - camera) * track.side > -_CROSSING_MARGIN * lane_width:
-        track.crossing = 0
-        return None
-    track.crossing += 1
-    if track.crossing < _CROSSING_FRAMES:
-        return None
-    track.side, track.crossing = -track.side, 0
-    if track.track_id is None:
-        return None
-    # A boundary that moves to the left shows that the camera moves to the right.
-    return LaneChange(track.track_id, "right" if track.side < 0 else "left")
+    if (place < 0.0) != (track.place < 0.0):
+        track.crossed = earlier + (now - earlier) * track.place / (track.place - place)
+    track.place = place
+    # A boundary that moves to the left shows that the vehicle moves to the right.
+    moves = -track.side * sideways < -_MOVING * lane_width
+    margin = _MOVING_MARGIN if moves else _MARGIN
+    if place * track.side > -margin * lane_width:
+        return False
+    track.side = -track.side
+    return True
 
 
-def lane_positions(tracks: Sequence[Track], columns: Sequence[float], camera: float, lane_width: float) -> list[int]:
-    """Returns the position of each track from its column at the bottom row.
+def lane_positions(tracks: Sequence[Track], places: Sequence[float], lane_width: float) -> list[int]:
+    """Returns the position of each track from its place, in row offsets from the vehicle's middle.
 
-    Boundaries are counted outwards from the camera. A gap of about two lane widths counts as two, so that a boundary
+    Boundaries are counted outwards from the vehicle. A gap of about two lane widths counts as two, so that a boundary
     that is not seen leaves its position empty.
     """
     result = [0] * len(tracks)
     for side in (-1, 1):
-        outwards = sorted((side * (columns[i] - camera), i) for i, track in enumerate(tracks) if track.side == side)
+        outwards = sorted((side * places[i], i) for i, track in enumerate(tracks) if track.side == side)
         position, last = 0, 0.0
         for number, (distance, index) in enumerate(outwards):
             gap = (distance - last) / lane_width

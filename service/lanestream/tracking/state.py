@@ -4,151 +4,161 @@ from __future__ import annotations
 
 from base64 import b64decode, b64encode
 from collections import deque
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, get_args
 
 import numpy as np
 
 from lanestream.errors import one_line
+from lanestream.road.results import TrackState
 from lanestream.road.view import LANE_WIDTHS, USUAL_LANE_WIDTH
-from lanestream.tracking.kalman import STATE, TrackedRows
-from lanestream.tracking.tracks import Track
+from lanestream.tracking.frame_clock import FrameClock
+from lanestream.tracking.kalman import Gaussian
+from lanestream.tracking.road_filter import MOST_PITCH, OWN, PITCH, ROAD, RoadFilter
+from lanestream.tracking.tracks import ACTIVITIES, FRAMES, SCALES, Track
 
-_NUMBERS: Final = "<f8"
-_FILTER_BYTES: Final = 8 * (STATE + STATE**2)
+# The road filter: its mean, and the lower triangle of its covariance.
+_NUMBER: Final = np.dtype("<f4")
+# A track; id 0 is that of a tentative one, and bit n of `hits` the frame n frames ago.
+_TRACK: Final = np.dtype(
+    [
+        ("track_id", "<u8"),
+        ("born", "<f8"),
+        ("last_hit", "<f8"),
+        ("crossed", "<f8"),
+        ("probability", "<f4"),
+        ("top", "<f4"),
+        ("bottom", "<f4"),
+        ("place", "<f4"),
+        ("scale", "<f4"),
+        ("paint", "<f4"),
+        ("side", "i1"),
+        ("state", "u1"),
+        ("hits", "u1"),
+        ("frames", "u1"),
+        ("surprising", "<u4"),
+    ]
+)
+_STATES: Final[tuple[TrackState, ...]] = get_args(TrackState)
 
 # The largest count or time in seconds of a saved state; larger integers are not exact as floats.
 MAX_COUNT: Final = float(2**53)
-# The limits of pixel coordinates, and of the numbers of a filter, which include velocities and variances.
+# The limits of pixel coordinates, of the depth of a view in pixels, and of the numbers of a filter, in depths.
 _MOST_PIXELS: Final = 1e6
-_MOST_IN_FILTER: Final = 1e10
-_MOST_TRACKS: Final = 128
-_MOST_HITS: Final = 32
+_LEAST_DEPTH: Final = 10.0
+_MOST_IN_FILTER: Final = 1e3
+_MOST_TRACKS: Final = 32
 # Of a wrong number in an error message.
 _MOST_DIGITS: Final = 24
-# Each tracked row is this much farther below the horizon than the next one, so that three rows determine a curve.
-_ROW_RATIO: Final = 1.1
-# By rounding, a covariance may be asymmetric, and an eigenvalue negative, by this share of its largest number.
-_ROUNDING: Final = 1e-12
-
-
-@dataclass(frozen=True)
-class TrackSnapshot:
-    """One track: `filter` holds its state (6) and covariance (6 x 6), little-endian doubles in base 64."""
-
-    track_id: int | None
-    filter: str
-    born: float
-    last_hit: float
-    probability: float
-    top: float
-    bottom: float
-    hits: tuple[bool, ...]
-    side: int
-    crossing: int
-    detected: bool
-    drift: float = 0.0
-
-    @classmethod
-    def of(cls, track: Track) -> TrackSnapshot:
-        """Returns the snapshot of `track`."""
-        numbers = np.concatenate([track.state, track.covariance.ravel()])
-        return cls(
-            track_id=track.track_id,
-            filter=b64encode(numbers.astype(_NUMBERS).tobytes()).decode(),
-            born=track.born,
-            last_hit=track.last_hit,
-            probability=track.probability,
-            top=track.top,
-            bottom=track.bottom,
-            hits=tuple(track.hits),
-            side=track.side,
-            crossing=track.crossing,
-            detected=track.detected,
-            drift=track.drift,
-        )
-
-    def validate(self, clock: float, next_id: int) -> None:
-        """Raises ValueError if no track of a tracker with this `clock` and `next_id` can have this state."""
-        if self.track_id is not None:
-            check_range("track_id", self.track_id, 1, next_id - 1)
-        check_range("last_hit", self.last_hit, 0.0, clock)
-        check_range("born", self.born, 0.0, self.last_hit)
-        check_range("probability", self.probability, 0.0, 1.0)
-        check_range("bottom", self.bottom, -_MOST_PIXELS, _MOST_PIXELS)
-        check_range("top", self.top, -_MOST_PIXELS, self.bottom)
-        check_range("number of hits", len(self.hits), 1, _MOST_HITS)
-        check_range("crossing", self.crossing, 0, MAX_COUNT)
-        check_range("drift", self.drift, 0.0, MAX_COUNT)
-        if self.side not in (-1, 1):
-            raise ValueError("the side of a track is neither -1 nor 1")
-        _check_filter(self.filter)
-
-    def track(self, memory: int) -> Track:
-        """Returns the track, which keeps the hits of `memory` frames. Raises ValueError for an incomplete filter."""
-        numbers = np.frombuffer(b64decode(self.filter, validate=True), _NUMBERS).astype(float)
-        return Track(
-            numbers[:STATE].copy(),
-            numbers[STATE:].reshape(STATE, STATE).copy(),
-            born=self.born,
-            last_hit=self.last_hit,
-            probability=self.probability,
-            top=self.top,
-            bottom=self.bottom,
-            hits=deque(self.hits, maxlen=memory),
-            side=self.side,
-            track_id=self.track_id,
-            crossing=self.crossing,
-            detected=self.detected,
-            drift=self.drift,
-        )
+# By rounding to single precision, an eigenvalue of a covariance scaled to correlations may be negative by this.
+_ROUNDING: Final = 1e-4
 
 
 @dataclass(frozen=True)
 class TrackerState:
-    """A tracker: its tracks, the rows at which it follows them, its clock, and the ids it has assigned."""
+    """A tracker: its tracks and its road filter, packed, and the rest that it remembers.
 
-    tracks: tuple[TrackSnapshot, ...] = ()
-    horizon: float | None = None
-    rows: tuple[float, float, float] | None = None
+    `tracks` and `filter` are arrays in base 64. `horizon` and `depth` are those of the filter, in pixels.
+    """
+
+    tracks: str = ""
+    filter: str = ""
+    horizon: float = 0.0
+    depth: float = 100.0
+    mean_horizon: float = 0.0
     lane_width: float = USUAL_LANE_WIDTH
     next_id: int = 1
-    clock: float = 0.0
-    last_timestamp: float | None = None
+    clock: FrameClock = field(default_factory=FrameClock)
     frames: int = 0
+    activity: float = 1.0
+
+    @classmethod
+    def packed(
+        cls,
+        tracks: Sequence[Track],
+        road: RoadFilter | None,
+        *,
+        mean_horizon: float,
+        lane_width: float,
+        next_id: int,
+        clock: FrameClock,
+        frames: int,
+        activity: float,
+    ) -> TrackerState:
+        """Returns the state of a tracker with these `tracks` on this `road`."""
+        if road is None:
+            return cls(lane_width=lane_width, next_id=next_id, clock=clock, frames=frames, activity=activity)
+        return cls(
+            tracks=_pack_tracks(tracks),
+            filter=_pack_filter(road),
+            horizon=road.horizon,
+            depth=road.depth,
+            mean_horizon=mean_horizon,
+            lane_width=lane_width,
+            next_id=next_id,
+            clock=clock,
+            frames=frames,
+            activity=activity,
+        )
+
+    def unpacked(self) -> tuple[list[Track], RoadFilter | None]:
+        """Returns the tracks and the road filter. Raises ValueError for incomplete ones."""
+        tracks = [_unpack_track(record) for record in _unpack(self.tracks, _TRACK)]
+        if not self.filter:
+            if tracks:
+                raise ValueError("the road filter is missing")
+            return [], None
+        numbers = _unpack(self.filter, _NUMBER).astype(np.float64)
+        size = ROAD + OWN * len(tracks)
+        if len(numbers) != size + size * (size + 1) // 2:
+            raise ValueError(f"the road filter has {len(numbers)} numbers, which are not those of {len(tracks)} tracks")
+        covariance = np.zeros((size, size))
+        lower = np.tril_indices(size)
+        covariance[lower] = numbers[size:]
+        covariance.T[lower] = numbers[size:]
+        return tracks, RoadFilter(self.horizon, self.depth, 0.0, Gaussian(numbers[:size].copy(), covariance))
 
     def validate(self) -> None:
         """Checks a state from outside this process. Raises ValueError, on one line, if no tracker can have it."""
-        check_range("number of tracks", len(self.tracks), 0, _MOST_TRACKS)
         check_range("frames", self.frames, 0, MAX_COUNT)
-        check_range("clock", self.clock, 0.0, MAX_COUNT)
-        check_range("last_timestamp", self.last_timestamp, -MAX_COUNT, MAX_COUNT)
+        check_range("activity", self.activity, *ACTIVITIES)
         check_range("lane_width", self.lane_width, *LANE_WIDTHS)
         check_range("next_id", self.next_id, 1, MAX_COUNT)
-        self._check_rows()
-        for track in self.tracks:
-            track.validate(self.clock, self.next_id)
-        ids = [track.track_id for track in self.tracks if track.track_id is not None]
+        check_range("horizon", self.horizon, -_MOST_PIXELS, _MOST_PIXELS)
+        check_range("depth", self.depth, _LEAST_DEPTH, _MOST_PIXELS)
+        reach = MOST_PITCH * self.depth
+        check_range("mean_horizon", self.mean_horizon, self.horizon - reach, self.horizon + reach)
+        check_range("clock", self.clock.now, 0.0, MAX_COUNT)
+        check_range("timestamp", self.clock.timestamp, -MAX_COUNT, MAX_COUNT)
+        check_range("step", self.clock.step, 1e-9, MAX_COUNT)
+        check_range("long_steps", self.clock.long_steps, 0, MAX_COUNT)
+        check_range("factor", self.clock.factor, 1e-3, 1.0)
+        tracks, road = self.unpacked()
+        check_range("number of tracks", len(tracks), 0, _MOST_TRACKS)
+        for track in tracks:
+            self._check_track(track)
+        ids = [track.track_id for track in tracks if track.track_id is not None]
         if len(set(ids)) < len(ids):
             raise ValueError("two tracks have the same id")
+        if road is not None:
+            _check_filter(road.state)
 
-    def _check_rows(self) -> None:
-        if self.horizon is None or self.rows is None:
-            if self.horizon is not None or self.rows is not None or self.tracks:
-                raise ValueError("the tracked rows or their horizon are missing")
-            return
-        check_range("horizon", self.horizon, -_MOST_PIXELS, _MOST_PIXELS)
-        # Row offsets below 1 count as 1.
-        near, middle, far = (max(row - self.horizon, 1.0) for row in self.rows)
-        if not (_MOST_PIXELS >= near >= _ROW_RATIO * middle >= _ROW_RATIO**2 * far):
-            raise ValueError(f"the tracked rows are {self.rows}, below the horizon {self.horizon:g}")
-
-    @property
-    def tracked_rows(self) -> TrackedRows | None:
-        """The rows as the tracker has them; None before its first frame."""
-        if self.horizon is None or self.rows is None:
-            return None
-        return TrackedRows(self.horizon, np.array(self.rows))
+    def _check_track(self, track: Track) -> None:
+        if track.track_id is not None:
+            check_range("track_id", track.track_id, 1, self.next_id - 1)
+        check_range("last_hit", track.last_hit, 0.0, self.clock.now)
+        check_range("born", track.born, 0.0, track.last_hit)
+        check_range("crossed", track.crossed, 0.0, self.clock.now)
+        check_range("probability", track.probability, 0.0, 1.0)
+        check_range("bottom", track.bottom, -_MOST_PIXELS, _MOST_PIXELS)
+        check_range("top", track.top, -_MOST_PIXELS, track.bottom)
+        check_range("place", track.place, -_MOST_IN_FILTER, _MOST_IN_FILTER)
+        check_range("scale", track.scale, *SCALES)
+        check_range("paint", track.paint, 0.0, 1.0)
+        check_range("number of hits", len(track.hits), 1, FRAMES)
+        if track.side not in (-1, 1):
+            raise ValueError("the side of a track is neither -1 nor 1")
 
 
 def check_range(name: str, value: float | None, least: float, most: float) -> None:
@@ -157,20 +167,67 @@ def check_range(name: str, value: float | None, least: float, most: float) -> No
         raise ValueError(f"{name} is {one_line(value, _MOST_DIGITS)}; expected {least:g} to {most:g}")
 
 
-def _check_filter(text: str) -> None:
-    """Raises ValueError unless `text` holds the state and the covariance of a filter."""
+def _pack_tracks(tracks: Sequence[Track]) -> str:
+    records = np.array(
+        [
+            (
+                track.track_id or 0,
+                track.born,
+                track.last_hit,
+                track.crossed,
+                track.probability,
+                track.top,
+                track.bottom,
+                track.place,
+                track.scale,
+                track.paint,
+                track.side,
+                _STATES.index(track.state),
+                sum(hit << age for age, hit in enumerate(reversed(track.hits))),
+                len(track.hits),
+                track.surprising,
+            )
+            for track in tracks
+        ],
+        _TRACK,
+    )
+    return b64encode(records.tobytes()).decode()
+
+
+def _unpack_track(record: np.void) -> Track:
+    values: dict[str, Any] = dict(zip(_TRACK.names or (), record.item(), strict=True))
+    state, hits, frames = (values.pop(name) for name in ("state", "hits", "frames"))
+    if state >= len(_STATES):
+        raise ValueError(f"the state of a track is {state}; expected 0 to {len(_STATES) - 1}")
+    values["track_id"] = values["track_id"] or None
+    recent = (bool(hits >> age & 1) for age in reversed(range(frames)))
+    return Track(**values, state=_STATES[state], hits=deque(recent, maxlen=FRAMES))
+
+
+def _pack_filter(road: RoadFilter) -> str:
+    state = road.state
+    numbers = np.concatenate([state.mean, state.covariance[np.tril_indices(len(state.mean))]])
+    return b64encode(numbers.astype(_NUMBER).tobytes()).decode()
+
+
+def _unpack(text: str, kind: np.dtype[np.void] | np.dtype[np.float32]) -> np.ndarray:
     try:
         data = b64decode(text, validate=True)
     except ValueError:
-        raise ValueError("the filter of a track is not valid base 64") from None
-    if len(data) != _FILTER_BYTES:
-        raise ValueError(f"the filter of a track has {len(data)} bytes; expected {_FILTER_BYTES}")
-    numbers = np.frombuffer(data, _NUMBERS)
-    if not (np.abs(numbers) <= _MOST_IN_FILTER).all():
-        raise ValueError("the filter of a track has numbers that are not finite, or too large")
-    covariance = numbers[STATE:].reshape(STATE, STATE)
-    tolerance = _ROUNDING * float(np.abs(covariance).max())
-    if (np.abs(covariance - covariance.T) > tolerance).any():
-        raise ValueError("the covariance of a track is not symmetric")
-    if np.linalg.eigvalsh(covariance)[0] < -tolerance or covariance.diagonal().min() < 0.0:
-        raise ValueError("the covariance of a track is not positive semidefinite")
+        raise ValueError("a packed array is not valid base 64") from None
+    if len(data) % kind.itemsize:
+        raise ValueError(f"a packed array has {len(data)} bytes; expected a multiple of {kind.itemsize}")
+    return np.frombuffer(data, kind)
+
+
+def _check_filter(state: Gaussian) -> None:
+    """Raises ValueError unless the numbers are finite and the covariance is positive semidefinite."""
+    if not (np.abs(state.mean) <= _MOST_IN_FILTER).all() or not (np.abs(state.covariance) <= _MOST_IN_FILTER).all():
+        raise ValueError("the road filter has numbers that are not finite, or too large")
+    check_range("pitch", float(state.mean[PITCH]), -MOST_PITCH, MOST_PITCH)
+    variances = state.covariance.diagonal()
+    if variances.min() < 0.0:
+        raise ValueError("the road filter has a negative variance")
+    scale = 1.0 / np.sqrt(np.maximum(variances, 1e-12))
+    if np.linalg.eigvalsh(state.covariance * np.outer(scale, scale))[0] < -_ROUNDING:
+        raise ValueError("the covariance of the road filter is not positive semidefinite")

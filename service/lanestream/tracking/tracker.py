@@ -2,302 +2,349 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from lanestream.road.curve import Curves, FloatArray
-from lanestream.road.results import Detection, EgoLane, FrameResult, LaneBoundary, LaneChange
+from lanestream.road.results import (
+    Detection,
+    EgoLane,
+    Estimate,
+    Event,
+    FrameResult,
+    LaneBoundary,
+    LaneChange,
+    SceneCut,
+    Side,
+)
 from lanestream.road.view import USUAL_LANE_WIDTH, RoadView, visible_spans
-from lanestream.tracking.association import associate, recover
-from lanestream.tracking.ego_lane import lane_change, lane_positions, learned_width
-from lanestream.tracking.kalman import MEASURED, TrackedRows, initial_state, predict, update
-from lanestream.tracking.state import TrackerState, TrackSnapshot
-from lanestream.tracking.tracks import Track
+from lanestream.tracking.association import associate
+from lanestream.tracking.ego_lane import has_changed_sides, lane_positions, learned_width
+from lanestream.tracking.frame_clock import FrameClock
+from lanestream.tracking.kalman import costs
+from lanestream.tracking.merging import SAME, merge
+from lanestream.tracking.road_filter import ROWS, RoadFilter
+from lanestream.tracking.state import TrackerState
+from lanestream.tracking.tracks import ACTIVITIES, ACTIVITY_GAINS, HITS, MOST_SURPRISE, Track, adapted
 
-# Lengths are shares of the depth of the road view. Boundaries are tracked at these rows, with this acceleration noise
-# (per second squared) and this sigma of the initial velocity (per second).
-_ROWS: Final[FloatArray] = np.array([1.0, 0.5, 0.2])
-_ACCELERATION: Final[FloatArray] = np.array([2.5, 1.6, 1.0])
-_SPEED: Final[FloatArray] = np.array([1.0, 0.5, 0.3])
-# Noise that is added to a detection's covariance: of its columns, and of the horizon's row as the camera pitches.
-_NOISE: Final = 0.05
-_PITCH: Final = 0.006
-# A track is confirmed by this many hits within this many frames, and coasts for this many seconds without any.
-_HITS: Final = 3
-_FRAMES: Final = 5
-_COAST_S: Final = 0.7
-# If the road turns or the camera pitches, the position of a coasting boundary is uncertain. It is reported until its
-# shifts at the near and the middle row, each over its row offset, have diverged by this in total.
-_MOST_DRIFT: Final = 0.15
-# In lane widths: a track restarts at a detection outside its gate that is closer than the first, and tracks closer than
-# the second follow one marking and are merged.
-_RECOVER: Final = 0.3
-_MERGE: Final = 0.35
-# The rows are chosen again if the horizon has moved by this much.
-_HORIZON_MOVED: Final = 0.02
+# In lane widths: a detection farther from a track than the first never belongs to it, and a boundary is reported while
+# the sigma of its place is at most the second.
+_FARTHEST: Final = 0.3
+_MOST_SIGMA: Final = 0.15
+# More boundaries than this are not tracked.
+_MOST_TRACKS: Final = 12
+# How quickly the mean horizon follows that of a frame (seconds), and how far it may move, in depths, before the rows
+# are chosen again.
+_HORIZON_S: Final = 0.2
+_HORIZON_MOVED: Final = 0.05
 
 
 class LaneTracker:
-    """Tracks the boundaries of one camera, one Kalman filter each.
+    """Tracks the boundaries of one camera with one road filter.
 
-    In the first frames of a camera tentative tracks are reported too, so that a single image has lanes and a stream has
-    them from its first frame on.
+    A boundary is reported from its third detection on. In the first frames of a stream, those that the ego-lane prior
+    expects are reported at once, and in a `single_image` all: no other frame will follow.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, single_image: bool = False) -> None:
+        self._single_image = single_image
         self._tracks: list[Track] = []
-        self._rows: TrackedRows | None = None
+        self._road: RoadFilter | None = None
+        self._mean_horizon = 0.0
         self._lane_width = USUAL_LANE_WIDTH
         self._next_id = 1
-        self._clock = 0.0
-        self._last_timestamp: float | None = None
+        self._clock = FrameClock()
         self._frames = 0
+        self._activity = 1.0
+        self._nis: FloatArray = np.zeros(0)
 
     @classmethod
-    def restored(cls, state: TrackerState, ids_lost: int = 0) -> LaneTracker:
+    def restored(cls, state: TrackerState, ids_lost: int = 0, single_image: bool = False) -> LaneTracker:
         """Returns a tracker that continues where `state` was taken.
 
         `ids_lost` more ids count as assigned, because a tracker that continued after `state` was taken and is now lost
         may have assigned them.
         Raises ValueError for an invalid state.
         """
-        tracker = cls()
-        tracker._tracks = [snapshot.track(_FRAMES) for snapshot in state.tracks]
-        tracker._rows = state.tracked_rows
+        tracker = cls(single_image)
+        tracker._tracks, tracker._road = state.unpacked()
+        tracker._mean_horizon = state.mean_horizon
         tracker._lane_width = state.lane_width
         tracker._next_id = state.next_id + ids_lost
-        tracker._clock, tracker._last_timestamp = state.clock, state.last_timestamp
+        tracker._clock = state.clock
         tracker._frames = state.frames
+        tracker._activity = state.activity
         return tracker
 
     @property
     def state(self) -> TrackerState:
         """Everything it remembers, to be restored later."""
-        rows = self._rows
-        return TrackerState(
-            tracks=tuple(TrackSnapshot.of(track) for track in self._tracks),
-            horizon=None if rows is None else rows.horizon,
-            rows=None if rows is None else (float(rows.y[0]), float(rows.y[1]), float(rows.y[2])),
+        return TrackerState.packed(
+            self._tracks,
+            self._road,
+            mean_horizon=self._mean_horizon,
             lane_width=self._lane_width,
             next_id=self._next_id,
             clock=self._clock,
-            last_timestamp=self._last_timestamp,
             frames=self._frames,
+            activity=self._activity,
         )
 
     @property
     def curves(self) -> Curves | None:
         """The confirmed boundaries in the last frame; None before the first frame."""
-        if self._rows is None:
+        if self._road is None:
             return None
-        columns = [track.columns for track in self._tracks if track.confirmed]
-        return self._rows.curves(np.array(columns).reshape(-1, MEASURED))
+        return self._road.curves().take(np.array([track.confirmed for track in self._tracks], bool))
 
-    def update(self, detections: Sequence[Detection], timestamp: float, view: RoadView) -> FrameResult:
+    @property
+    def nis(self) -> FloatArray:
+        """The normalized innovations squared of the last frame's updates, per degree of freedom; 1 on average."""
+        return self._nis
+
+    def seconds_until(self, timestamp: float) -> float:
+        """Returns the seconds from the last frame to one captured at `timestamp`."""
+        return self._clock.advanced(timestamp)[0].now - self._clock.now
+
+    def update(
+        self,
+        detections: Sequence[Detection],
+        timestamp: float,
+        view: RoadView,
+        middle: float = 0.0,
+        is_cut: bool = False,
+    ) -> FrameResult:
         """Takes the `detections` of the frame captured at `timestamp` (seconds) in `view`, and returns its result.
 
-        A timestamp that goes backwards counts as no time passing.
+        `middle` is the lateral place of the vehicle's middle, in columns per row offset. With `is_cut`, the frame shows
+        another scene than the last one, and all boundaries are new.
         """
-        rows = self._rows_for(view)
-        self._predict(self._elapsed(timestamp), view)
-        self._delete_old()
-        columns, noise = self._measure(detections, rows, view)
-        pairs = associate(self._tracks, columns, noise)
-        recovered = recover(self._tracks, columns, pairs, self._in_lane_widths(_RECOVER, view))
-        taken = {j for _, j in recovered}
-        self._update([pair for pair in pairs if pair[1] not in taken], recovered, detections, columns, noise, view)
+        earlier = self._clock.now
+        self._clock, warnings = self._clock.advanced(timestamp)
+        events: list[Event] = []
+        road = self._predicted_road(view, self._clock.now - earlier)
+        values, noise = road.measure(detections)
+        pairs = self._associate(road, values, noise)
+        if is_cut or self._is_surprised(pairs, detections):
+            events.append(SceneCut(timestamp))
+            self._tracks, self._frames, self._activity, pairs = [], 0, 1.0, []
+            self._lane_width, self._mean_horizon = USUAL_LANE_WIDTH, view.horizon
+            road = RoadFilter.started(view)
+            values, noise = road.measure(detections)
+        road, pairs = self._with_new_tracks(road, pairs, detections, middle)
+        self._road = self._updated(road, pairs, detections, values, noise)
         self._frames += 1
-        self._confirm()
-        self._tracks = self._merged([track for track in self._tracks if self._is_alive(track, view)], view)
-        return self._result(view, rows)
-
-    def _elapsed(self, timestamp: float) -> float:
-        last, self._last_timestamp = self._last_timestamp, timestamp
-        seconds = 0.0 if last is None else max(0.0, timestamp - last)
-        self._clock += seconds
-        return seconds
-
-    def _rows_for(self, view: RoadView) -> TrackedRows:
-        """Returns the tracked rows, chosen again if the horizon has moved too far."""
-        if self._rows is None or abs(self._rows.horizon - view.horizon) > _HORIZON_MOVED * view.depth:
-            rows = TrackedRows.of(view, _ROWS)
-            for track in self._tracks:
-                track.change_rows(self._rows or rows, rows)
-            self._rows = rows
-        return self._rows
-
-    def _in_lane_widths(self, number: float, view: RoadView) -> FloatArray:
-        """Returns `number` lane widths in pixels at the tracked rows (3,)."""
-        return number * self._lane_width * _ROWS * view.depth
-
-    def _predict(self, seconds: float, view: RoadView) -> None:
+        if not self._road.is_sound:
+            self._tracks, self._road, self._mean_horizon = [], RoadFilter.started(view), view.horizon
+        if not self._single_image:
+            self._keep_only([i for i, track in enumerate(self._tracks) if self._is_alive(i, track)])
+            self._merge_and_confirm()
+        events += self._lane_changes(earlier, middle)
         for track in self._tracks:
-            track.previous_columns = track.columns
-        if not self._tracks:
-            return
-        # A track is deleted after the coasting time anyway; a longer step could overflow.
-        states, covariances = predict(
-            np.stack([track.state for track in self._tracks]),
-            np.stack([track.covariance for track in self._tracks]),
-            min(seconds, 2.0 * _COAST_S),
-            _ACCELERATION * view.depth,
+            track.round()
+        return replace(self._result(detections, view, middle), events=tuple(events), warnings=warnings)
+
+    def _predicted_road(self, view: RoadView, seconds: float) -> RoadFilter:
+        """Returns the road at this frame's time, and drops the tracks that are too old after a gap in the stream."""
+        self._keep_only(
+            [i for i, track in enumerate(self._tracks) if track.is_alive(self._clock.now, self._clock.step)]
         )
-        for track, state, covariance in zip(self._tracks, states, covariances, strict=True):
-            track.state, track.covariance = state, covariance
+        if self._road is None or not self._tracks:
+            # The stream counts as new.
+            self._frames, self._activity, self._mean_horizon = 0, 1.0, view.horizon
+            return RoadFilter.started(view)
+        gain = 1.0 - float(np.exp(-seconds / _HORIZON_S))
+        self._mean_horizon += max(gain, 1.0 / (self._frames + 1.0)) * (view.horizon - self._mean_horizon)
+        road = self._road.resting_at(self._mean_horizon)
+        if abs(road.rest) > _HORIZON_MOVED:
+            road = road.below(view.with_horizon(self._mean_horizon))
+        coasting = np.array([not track.hits[-1] for track in self._tracks], bool)
+        scales = np.array([track.scale for track in self._tracks])
+        return road.predicted(seconds, self._activity, scales, coasting)
 
-    def _delete_old(self) -> None:
-        """Deletes tracks that are too old after a gap in the stream; if none is left, the stream counts as new."""
-        self._tracks = [track for track in self._tracks if self._clock - track.last_hit <= _COAST_S]
-        if not self._tracks:
-            self._frames = 0
+    def _associate(self, road: RoadFilter, values: FloatArray, noise: FloatArray) -> list[tuple[int, int]]:
+        if not self._tracks or not len(values):
+            return []
+        expected, covariances = road.expected()
+        # Places are compared at the middle row, which both know well.
+        apart = (values[:, 1] - expected[:, 1, None]) / ROWS[1]
+        return associate(
+            expected[:, 1] / ROWS[1],
+            costs(expected, covariances, values, noise),
+            apart,
+            _FARTHEST * self._lane_width,
+        )
 
-    def _measure(
-        self, detections: Sequence[Detection], rows: TrackedRows, view: RoadView
-    ) -> tuple[FloatArray, FloatArray]:
-        """Returns the columns (M, 3) of detections and their covariances (M, 3, 3).
+    def _is_surprised(self, pairs: Sequence[tuple[int, int]], detections: Sequence[Detection]) -> bool:
+        """Returns whether the frame shows another scene: nothing is where several boundaries were a frame ago."""
+        seen = sum(track.confirmed and track.hits[-1] for track in self._tracks)
+        return seen >= 2 and len(detections) >= 2 and not pairs
 
-        A covariance is the sum of those of the fit, of the detector's noise and of the pitch, which moves all rows.
-        """
-        columns, noise = np.empty((len(detections), MEASURED)), np.empty((len(detections), MEASURED, MEASURED))
-        for j, detection in enumerate(detections):
-            columns[j], noise[j] = rows.measure(detection.curve, detection.covariance)
-            pitch = detection.curve.slope(rows.y) * _PITCH * view.depth
-            noise[j] += np.outer(pitch, pitch)
-        return columns, noise + (_NOISE * view.depth) ** 2 * np.eye(MEASURED)
+    def _with_new_tracks(
+        self, road: RoadFilter, pairs: list[tuple[int, int]], detections: Sequence[Detection], middle: float
+    ) -> tuple[RoadFilter, list[tuple[int, int]]]:
+        """Begins a track for each unmatched detection; returns the road with them, and all pairs."""
+        taken = {j for _, j in pairs}
+        new = [j for j in range(len(detections)) if j not in taken][: max(0, _MOST_TRACKS - len(self._tracks))]
+        if not new:
+            return road, pairs
+        pairs = [*pairs, *((len(self._tracks) + number, j) for number, j in enumerate(new))]
+        road = road.with_boundaries(Curves.of([detections[j].curve for j in new]))
+        now, known = self._clock.now, len(self._tracks)
+        for place, j in zip(road.places[known:].tolist(), new, strict=True):
+            self._tracks.append(Track.begun(detections[j], place - middle, now))
+        if self._frames < HITS:
+            at_once = [known + n for n, j in enumerate(new) if self._single_image or detections[j].expected]
+            self._confirm(at_once)
+        return road, pairs
 
-    def _update(
+    def _updated(
         self,
+        road: RoadFilter,
         pairs: Sequence[tuple[int, int]],
-        recovered: Sequence[tuple[int, int]],
         detections: Sequence[Detection],
-        columns: FloatArray,
+        values: FloatArray,
         noise: FloatArray,
-        view: RoadView,
-    ) -> None:
-        """Updates matched tracks, moves unmatched ones, and begins a track for each unmatched detection."""
-        tracks = self._tracks
+    ) -> RoadFilter:
+        matched = dict(pairs)
+        surprises = np.zeros(0)
         if pairs:
-            mine, theirs = np.array(pairs).T
-            states, covariances = update(
-                np.stack([tracks[i].state for i in mine]),
-                np.stack([tracks[i].covariance for i in mine]),
-                columns[theirs],
-                noise[theirs],
-            )
-            for i, state, covariance in zip(mine, states, covariances, strict=True):
-                tracks[i].state, tracks[i].covariance = state, covariance
-        for i, j in recovered:
-            tracks[i].state, tracks[i].covariance = initial_state(columns[j], noise[j], _SPEED * view.depth)
-        matched = dict([*pairs, *recovered])
-        for i, track in enumerate(tracks):
+            mine, theirs = np.array(pairs, np.intp).T
+            scales = np.array([self._tracks[i].noise_scale(detections[j]) for i, j in pairs])
+            scaled = noise[theirs] * scales[:, None, None]
+            road = road.loosened([i for i in mine.tolist() if self._tracks[i].is_elsewhere])
+            road, distances = road.updated(mine, values[theirs], scaled)
+            surprises = distances / 3.0
+        self._nis = surprises[[i for i, (track, _) in enumerate(pairs) if self._tracks[track].hits]]
+        self._adapt_activity(road, matched)
+        by_track = dict(zip([i for i, _ in pairs], surprises.tolist(), strict=True))
+        for i, track in enumerate(self._tracks):
             if i in matched:
-                track.hit(detections[matched[i]], self._clock)
+                track.hit(detections[matched[i]], by_track[i], self._clock.now)
             else:
                 track.miss()
-        self._coast(set(matched), view)
-        taken = set(matched.values())
-        self._tracks += [
-            self._new_track(detection, columns[j], noise[j], view)
-            for j, detection in enumerate(detections)
-            if j not in taken
-        ]
+        return road.rounded()
 
-    def _coast(self, matched: set[int], view: RoadView) -> None:
-        """Moves unmatched tracks by the median motion of matched ones, which is the camera's motion."""
-        seen = [
-            track.columns - track.previous_columns
-            for i, track in enumerate(self._tracks)
-            if i in matched and track.confirmed and track.detected_twice
-        ]
-        for i, track in enumerate(self._tracks):
-            if i not in matched:
-                if seen:
-                    moved = track.previous_columns + np.median(seen, axis=0)
-                    track.state = np.concatenate([moved, track.state[MEASURED:]])
-                track.coast(_ROWS * view.depth)
+    def _adapt_activity(self, road: RoadFilter, matched: Mapping[int, int]) -> None:
+        """Lets the activity of the road follow the innovations of known tracks.
 
-    def _new_track(self, detection: Detection, columns: FloatArray, noise: FloatArray, view: RoadView) -> Track:
-        state, covariance = initial_state(columns, noise, _SPEED * view.depth)
-        return Track(
-            state,
-            covariance,
-            born=self._clock,
-            last_hit=self._clock,
-            probability=detection.probability,
-            top=detection.top,
-            bottom=detection.bottom,
-            hits=deque([True], maxlen=_FRAMES),
-            side=1 if detection.curve.x(view.bottom) >= view.middle else -1,
-        )
+        A track that was not matched although a new one begins near it is as surprising as can be.
+        """
+        known = [i for i, track in enumerate(self._tracks) if track.hits]
+        new = road.places[len(known) :]
+        nis = self._nis.tolist()
+        for i in known:
+            missed = i not in matched and self._tracks[i].confirmed and self._tracks[i].hits[-1]
+            if missed and (np.abs(new - road.places[i]) < SAME * self._lane_width).any():
+                nis.append(MOST_SURPRISE)
+        if nis:
+            self._activity = adapted(self._activity, float(np.mean(nis)), ACTIVITY_GAINS, ACTIVITIES)
 
-    def _confirm(self) -> None:
-        for track in sorted(self._tracks, key=lambda each: float(each.columns[0])):
-            if not track.confirmed and (sum(track.hits) >= _HITS or self._frames < _HITS):
-                track.track_id = self._next_id
+    def _confirm(self, indices: Sequence[int]) -> None:
+        """Gives an identity to those of the tracks at `indices` that have none."""
+        for i in indices:
+            if not self._tracks[i].confirmed:
+                self._tracks[i].track_id = self._next_id
                 self._next_id += 1
 
-    def _is_alive(self, track: Track, view: RoadView) -> bool:
-        if not track.confirmed:
-            return len(track.hits) - sum(track.hits) <= _FRAMES - _HITS
-        return float(np.sqrt(track.covariance[0, 0])) <= _MERGE * self._lane_width * view.depth
+    @property
+    def _places(self) -> FloatArray:
+        return np.zeros(0) if self._road is None else self._road.places
 
-    def _merged(self, tracks: list[Track], view: RoadView) -> list[Track]:
-        """Returns the tracks without those that have converged on an older one, which keeps its identity."""
-        kept: list[Track] = []
-        limit = self._in_lane_widths(_MERGE, view)
-        for track in sorted(tracks, key=lambda each: (not each.confirmed, each.born, each.track_id or 0)):
-            if not any(bool((np.abs(track.columns - other.columns) < limit)[:2].all()) for other in kept):
-                kept.append(track)
-        return kept
+    def _keep_only(self, kept: list[int]) -> None:
+        if len(kept) < len(self._tracks) and self._road is not None:
+            self._tracks = [self._tracks[i] for i in kept]
+            self._road = self._road.with_only(kept)
 
-    def _result(self, view: RoadView, rows: TrackedRows) -> FrameResult:
-        reported = [track for track in self._tracks if track.confirmed and track.drift <= _MOST_DRIFT]
-        tracks = sorted(reported, key=lambda each: float(each.columns[0]))
-        if not tracks:
+    def _is_alive(self, index: int, track: Track) -> bool:
+        if self._road is None or not track.is_alive(self._clock.now, self._clock.step):
+            return False
+        return not track.confirmed or self._road.place_sigmas[index] <= SAME * self._lane_width
+
+    def _merge_and_confirm(self) -> None:
+        """Merges the tracks that follow one marking, and confirms those with enough hits."""
+        if self._road is None:
+            return
+        curves = self._road.curves()
+        positions = curves.x(self._road.rows[:2]) / (self._road.depth * ROWS[:2])
+        survivors = merge(self._tracks, positions, self._lane_width)
+        self._road = self._road.with_only([survivor.slot for survivor in survivors])
+        self._tracks = [self._tracks[survivor.track] for survivor in survivors]
+        certain = [i for i, survivor in enumerate(survivors) if not survivor.contested]
+        self._confirm([i for i in certain if self._tracks[i].has_enough_hits])
+
+    def _lane_changes(self, earlier: float, middle: float) -> list[LaneChange]:
+        """Records where the boundaries are; returns the lane changes of boundaries that have just changed sides."""
+        if self._road is None:
+            return []
+        sideways, now = self._road.sideways.value, self._clock.now
+        changes = []
+        for track, place in zip(self._tracks, (self._places - middle).tolist(), strict=True):
+            if has_changed_sides(track, place, sideways, self._lane_width, earlier, now) and track.track_id is not None:
+                # A boundary that is now on the left shows that the vehicle moved to the right.
+                side: Side = "right" if track.side < 0 else "left"
+                changes.append(LaneChange(track.track_id, side, self._clock.timestamp_at(track.crossed)))
+        return changes
+
+    def _result(self, detections: Sequence[Detection], view: RoadView, middle: float) -> FrameResult:
+        road = self._road
+        if road is None or not self._tracks:
             return FrameResult((), EgoLane(), view.horizon)
-        curves = rows.curves(np.stack([track.columns for track in tracks]))
-        covariances = rows.covariances_of_curves(np.stack([track.covariance[:MEASURED, :MEASURED] for track in tracks]))
-        columns = curves.x(np.array([view.bottom]))[:, 0].tolist()
-        lane_width = self._lane_width * view.depth
-        changes = [lane_change(track, x, view.middle, lane_width) for track, x in zip(tracks, columns, strict=True)]
-        positions = lane_positions(tracks, columns, view.middle, lane_width)
-        spans = visible_spans(curves, view)
-        lanes = [
+        sigmas = road.place_sigmas
+        reported = [
+            i
+            for i in np.argsort(self._places, kind="stable").tolist()
+            if self._single_image or (self._tracks[i].confirmed and sigmas[i] <= _MOST_SIGMA * self._lane_width)
+        ]
+        if not reported:
+            return FrameResult((), EgoLane(), road.pitched_horizon)
+        if self._single_image:
+            # With one frame there is nothing to filter.
+            found = [detections[i] for i in reported]
+            curves = Curves.of([detection.curve for detection in found])
+            covariances = np.stack([detection.covariance for detection in found])
+        else:
+            scales = np.array([track.bias_scale for track in self._tracks])
+            curves, covariances = road.curves().take(reported), road.covariances(scales)[reported]
+        horizon = curves.horizon
+        tracks = [self._tracks[i] for i in reported]
+        positions = lane_positions(tracks, (self._places[reported] - middle).tolist(), self._lane_width)
+        spans = visible_spans(curves, view.with_horizon(horizon))
+        lanes = tuple(
             LaneBoundary(
                 track_id=track.track_id or 0,
                 position=positions[i],
-                state="detected" if track.detected else "predicted",
-                probability=track.probability * self._fading(track),
+                state=track.state,
+                probability=track.probability * track.fading(self._clock.now),
                 curve=curves[i],
                 covariance=covariances[i],
                 top=max(float(spans.top[i]), track.top),
                 bottom=float(spans.bottom[i]),
-                age_s=self._clock - track.born,
+                age_s=self._clock.now - track.born,
             )
             for i, track in enumerate(tracks)
             if spans.visible[i]
-        ]
-        events = tuple(change for change in changes if isinstance(change, LaneChange))
-        return FrameResult(tuple(lanes), self._ego_lane(tracks, columns, positions, view), view.horizon, events)
+        )
+        at = dict(zip(positions, reported, strict=True))
+        return FrameResult(lanes, self._ego_lane(road, at.get(-1), at.get(1), view), horizon, road=road.estimate)
 
-    def _fading(self, track: Track) -> float:
-        """Returns the factor of a track's probability, which falls with the time since its last detection."""
-        return 1.0 - 0.5 * min(1.0, (self._clock - track.last_hit) / _COAST_S)
-
-    def _ego_lane(
-        self, tracks: Sequence[Track], columns: Sequence[float], positions: Sequence[int], view: RoadView
-    ) -> EgoLane:
-        at = {position: index for index, position in enumerate(positions)}
-        left, right = at.get(-1), at.get(1)
-        offset = None
-        if left is not None and right is not None:
-            width = columns[right] - columns[left]
-            self._lane_width = learned_width(self._lane_width, width / view.depth)
-            if width > 0.0:
-                offset = (view.middle - 0.5 * (columns[left] + columns[right])) / width
-        return EgoLane(
-            None if left is None else tracks[left].track_id, None if right is None else tracks[right].track_id, offset
+    def _ego_lane(self, road: RoadFilter, left: int | None, right: int | None, view: RoadView) -> EgoLane:
+        """Returns the ego lane between the tracks at the indices `left` and `right`, and learns the lane width."""
+        ids = [None if i is None else self._tracks[i].track_id for i in (left, right)]
+        ego = EgoLane(left=ids[0], right=ids[1])
+        if left is None or right is None:
+            return ego
+        width = float(road.places[right] - road.places[left])
+        if self._tracks[left].hits[-1] and self._tracks[right].hits[-1]:
+            self._lane_width = learned_width(self._lane_width, width)
+        if width <= 0.0:
+            return ego
+        center, sideways = road.lane_center(left, right), road.sideways
+        return replace(
+            ego,
+            offset=Estimate((view.middle / road.depth - center.value) / width, center.sigma / width),
+            lateral_speed=Estimate(sideways.value / width, sideways.sigma / width),
         )

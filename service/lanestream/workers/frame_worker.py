@@ -15,6 +15,7 @@ from lanestream.images.decoding import ImageLimits, decode_reduced
 from lanestream.inference.batcher import Batcher, BatchReport
 from lanestream.messages import ProcessedFrame
 from lanestream.road.view import WORKING_WIDTH
+from lanestream.tracking.departure import VehicleMotion
 
 if TYPE_CHECKING:
     from lanestream.detection.interface import ModelRole
@@ -30,13 +31,15 @@ _WAITED_SHARE: Final = 0.25
 class EncodedFrame:
     """An image file, when it was captured (the client's seconds) and when it arrived (monotonic seconds).
 
-    After `deadline` (monotonic seconds) its lanes are no longer needed; None means no deadline.
+    After `deadline` (monotonic seconds) its lanes are no longer needed; None means no deadline. `motion` is what the
+    vehicle reported with it.
     """
 
     data: bytes
     timestamp: float
     arrived: float
     deadline: float | None = None
+    motion: VehicleMotion = VehicleMotion()
 
 
 class FrameWorker:
@@ -79,7 +82,7 @@ class FrameWorker:
             raise ExpiredError()
         picture = decode_reduced(frame.data, self._limits, WORKING_WIDTH)
         decoded = time.monotonic()
-        result = session.process(picture.image, frame.timestamp, inference)
+        result = session.process(picture.image, frame.timestamp, inference, frame.motion, picture.size)
         total = 1e3 * (time.monotonic() - frame.arrived)
         stages = {"decode": 1e3 * (decoded - started), "infer": 1e3 * inference.ran_s, **result.timing_ms}
         timing = {**stages, "queue": max(0.0, total - sum(stages.values())), "total": total}

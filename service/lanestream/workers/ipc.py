@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lanestream.images.decoding import ImageLimits
     from lanestream.inference.batcher import BatchReport
     from lanestream.messages import ProcessedFrame
-    from lanestream.session import SessionState
+    from lanestream.session import SessionOptions, SessionState
     from lanestream.workers.frame_worker import EncodedFrame
 
     FrameOutcome = tuple[ProcessedFrame, SessionState] | Exception
@@ -39,12 +39,11 @@ class WorkerSetup:
 
 @dataclass(frozen=True)
 class FrameJob:
-    """A frame and the session it belongs to; `horizon` and `detector` are those of `WorkerPool.open_session`."""
+    """A frame, and the state and options of the session it belongs to."""
 
     frame: EncodedFrame
     state: SessionState
-    horizon: float | None
-    detector: str | None
+    options: SessionOptions
 
 
 @dataclass(frozen=True)

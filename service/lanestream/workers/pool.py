@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Literal, ParamSpec, Protocol, TypeVar
 
+from lanestream.session import DEFAULT_SESSION, SessionOptions
 from lanestream.workers.admission import FairSemaphore, Slot
 
 if TYPE_CHECKING:
@@ -82,11 +83,8 @@ class WorkerPool(ABC):
         return self._admission.slot(caller, latest=latest)
 
     @abstractmethod
-    def open_session(self, horizon: float | None = None, detector: str | None = None) -> SessionHandle:
-        """Returns a new camera's session; `horizon` is its row as a share of the image height, estimated if None.
-
-        Raises NoDetectorError if `detector` is missing.
-        """
+    def open_session(self, options: SessionOptions = DEFAULT_SESSION) -> SessionHandle:
+        """Returns a new camera's session. Raises NoDetectorError if its detector is missing."""
 
     @abstractmethod
     async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from lanestream.errors import LanestreamError, NotReadyError, WorkerLostError
 from lanestream.host import memory_limit, processors, yield_processor
 from lanestream.inference.providers import PROVIDERS
-from lanestream.session import SessionState
+from lanestream.session import DEFAULT_SESSION, SessionOptions, SessionState
 from lanestream.tracking.tracker import LaneTracker
 from lanestream.workers.ipc import FrameDone, FrameJob, WorkerSetup
 from lanestream.workers.pool import SessionHandle, WorkerEvent, WorkerPool
@@ -65,9 +65,8 @@ _RESTARTS: Final = RestartPolicy()
 class RemoteSession:
     """A session whose frames are processed in other processes."""
 
-    def __init__(self, horizon: float | None, detector: str | None) -> None:
-        self.horizon = horizon
-        self.detector = detector
+    def __init__(self, options: SessionOptions) -> None:
+        self.options = options
         self.state = SessionState()
 
     def restore(self, state: SessionState, ids_lost: int = 0) -> None:
@@ -164,10 +163,10 @@ class ProcessPool(WorkerPool):
     def _alive(self) -> list[Worker]:
         return [worker for worker in self._workers if worker.is_alive]
 
-    def open_session(self, horizon: float | None = None, detector: str | None = None) -> SessionHandle:
+    def open_session(self, options: SessionOptions = DEFAULT_SESSION) -> SessionHandle:
         """Returns a new camera's session, see `WorkerPool.open_session`."""
-        self.capabilities.select(detector)
-        return RemoteSession(horizon, detector)
+        self.capabilities.select(options.detector)
+        return RemoteSession(options)
 
     async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:
         """Returns the lanes of `frame`, see `WorkerPool.run`.
@@ -176,7 +175,7 @@ class ProcessPool(WorkerPool):
         waited in that worker goes to another one; raises NotReadyError if there are none.
         """
         assert isinstance(session, RemoteSession)  # noqa: S101 - opened here
-        done = await self._process(FrameJob(frame, session.state, session.horizon, session.detector), slot)
+        done = await self._process(FrameJob(frame, session.state, session.options), slot)
         if self._observe is not None:
             for report in done.batches:
                 self._observe(report)

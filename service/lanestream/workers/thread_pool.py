@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from lanestream.session import Session
+from lanestream.session import DEFAULT_SESSION, Session, SessionOptions
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame, FrameWorker
 from lanestream.workers.pool import SessionHandle, WorkerPool
@@ -36,9 +36,9 @@ class ThreadPool(WorkerPool):
         self._engine = engine
         self._worker = FrameWorker(engine.models, limits, observe)
 
-    def open_session(self, horizon: float | None = None, detector: str | None = None) -> SessionHandle:
+    def open_session(self, options: SessionOptions = DEFAULT_SESSION) -> SessionHandle:
         """Returns a new camera's session, see `WorkerPool.open_session`."""
-        return self._engine.open_session(horizon, detector)
+        return self._engine.open_session(options)
 
     async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:
         """Returns the lanes of `frame`, see `WorkerPool.run`."""

@@ -81,7 +81,7 @@ class WorkerProcess:
         outcome: FrameOutcome
         try:
             job: FrameJob = decode_message(message)
-            session = self._engine.open_session(job.horizon, job.detector)
+            session = self._engine.open_session(job.options)
             session.restore(job.state)
             outcome = self._worker.process(session, job.frame, costs.append), session.state
         except BaseException as error:  # whatever a thread of the executor would end with, silently

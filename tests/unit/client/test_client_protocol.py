@@ -15,6 +15,7 @@ from lanestream.protocol import (
     Mode,
     StartMessage,
     SummaryMessage,
+    warning_message,
 )
 from lanestream_client.client_protocol import ClientProtocol, ClientState
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
@@ -104,6 +105,22 @@ def test_two_frames_are_in_flight_until_one_is_answered(mode: Mode) -> None:
     assert outcomes(protocol.receive(lanes(0))) == [(0, "lanes")]
     assert sent(protocol) == [2]
     assert protocol.wants_frame
+
+
+def test_the_motion_of_the_vehicle_is_sent_with_its_frame() -> None:
+    protocol = open_protocol()
+    protocol.add_frame(SourceFrame(0, 0.0, speed=24.5, indicator="left"), b"x")
+    header, _ = protocol.messages_to_send()
+    assert json.loads(header) == {"type": "frame", "seq": 0, "timestamp": 0.0, "speed": 24.5, "indicator": "left"}
+
+
+def test_warnings_are_kept_and_settle_no_frame() -> None:
+    protocol = open_protocol()
+    send(protocol, 0)
+    warning = warning_message("timestamps_in_milliseconds", 0)
+    assert protocol.receive(warning.model_dump_json()) == []
+    assert protocol.warnings == (warning,)
+    assert outcomes(protocol.receive(lanes(0))) == [(0, "lanes")]
 
 
 def test_the_service_can_grant_fewer_frames_in_flight() -> None:

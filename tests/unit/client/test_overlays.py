@@ -7,15 +7,35 @@ import numpy as np
 import pytest
 
 from lanestream.errors import SourceError
-from lanestream.local import LocalEngine
-from lanestream.protocol import LanesMessage, error_message
+from lanestream.protocol import DepartureModel, EgoModel, LaneModel, LanesMessage, LineModel, error_message
 from lanestream.road.view import Image
+from lanestream_client.canvas import ALERT, CAUTION
 from lanestream_client.overlays import draw_error, draw_lanes
 
 
 def road(width: int, height: int) -> tuple[Image, LanesMessage]:
-    image = np.full((height, width, 3), 90, np.uint8)
-    return image, LocalEngine(fakes.engine()).open_camera().lanes(image, seq=7, timestamp=0.0)
+    """Returns a gray image, and a straight lane whose middle is the image's."""
+    horizon, top, bottom = 0.4 * height, 0.5 * height, height - 1.0
+    lanes = []
+    for track_id, position in ((1, -1), (2, 1)):
+        curve = (width / 2.0, 0.3 * position * width / (height - horizon), 0.0)
+        ends = [(curve[0] + curve[1] * (row - horizon), row) for row in (bottom, top)]
+        lane = LaneModel(
+            track_id=track_id,
+            position=position,
+            state="detected",
+            probability=0.9,
+            points=ends,
+            line=LineModel(bottom=ends[0], top=ends[1]),
+            horizon=horizon,
+            coefficients=curve,
+            covariance=np.eye(3).tolist(),
+            age_s=1.0,
+        )
+        lanes.append(lane)
+    ego = EgoModel(left=1, right=2, offset=0.0)
+    update = {"width": width, "height": height, "horizon": horizon, "lanes": lanes, "ego": ego}
+    return np.full((height, width, 3), 90, np.uint8), fakes.lanes(7).model_copy(update=update)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (320, 180), (64, 64), (3840, 2160), (181, 101)])
@@ -35,7 +55,7 @@ def test_lanes_are_drawn_at_any_size(width: int, height: int) -> None:
     assert middle[1] > middle[2], "the ego lane is green"
 
 
-def test_predicted_boundaries_are_dashed() -> None:
+def test_boundaries_without_a_detection_are_dashed() -> None:
     image, message = road(1280, 720)
 
     def drawn_pixels(state: str) -> int:
@@ -43,7 +63,70 @@ def test_predicted_boundaries_are_dashed() -> None:
         drawn = draw_lanes(image, message.model_copy(update={"lanes": [lane]}))
         return int((drawn[360:] != 90).any(axis=2).sum())
 
-    assert drawn_pixels("predicted") < 0.75 * drawn_pixels("detected")
+    predicted, inferred, detected = (drawn_pixels(state) for state in ("predicted", "inferred", "detected"))
+    assert predicted < 0.75 * detected
+    assert 1.1 * predicted < inferred < 0.95 * detected
+
+
+def in_meters(message: LanesMessage, offset_m: float, departure: DepartureModel, variance: float) -> LanesMessage:
+    """Returns `message` as if the camera were known; the boundaries' distances have this variance."""
+    lanes = [
+        lane.model_copy(
+            update={
+                "ground": (0.001, 0.0, side * 1.8 + offset_m),
+                "ground_covariance": np.diag([0, 0, variance]).tolist(),
+            }
+        )
+        for lane, side in zip(message.lanes, (1.0, -1.0), strict=True)
+    ]
+    ego = message.ego.model_copy(update={"offset": offset_m / 3.6, "offset_m": offset_m, "lane_width_m": 3.6})
+    return message.model_copy(update={"lanes": lanes, "ego": ego, "departure": departure})
+
+
+def with_color(image: Image, color: tuple[int, int, int]) -> int:
+    return int((np.abs(image.astype(int) - color).max(axis=2) < 30).sum())
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (320, 180), (64, 64), (3840, 2160), (181, 101)])
+def test_meters_are_drawn_at_any_size(width: int, height: int) -> None:
+    image, message = road(width, height)
+    drawn = draw_lanes(image, in_meters(message, 0.3, DepartureModel(state="none"), 0.01))
+    assert drawn.shape == image.shape
+
+
+def test_a_departure_is_shown_in_its_color() -> None:
+    image, message = road(1280, 720)
+
+    def panel(departure: DepartureModel) -> Image:
+        return draw_lanes(image, in_meters(message, 1.2, departure, 0.01))[:200, 640:1100]
+
+    none = panel(DepartureModel(state="none"))
+    warning = panel(DepartureModel(state="warning", side="right", time_to_crossing=0.7))
+    crossed = panel(DepartureModel(state="crossed", side="right", time_to_crossing=0.0))
+    assert with_color(none, CAUTION) == with_color(none, ALERT) == 0
+    assert with_color(warning, CAUTION) > 200
+    assert with_color(crossed, ALERT) > 200
+
+
+def test_the_offset_bar_shows_the_side() -> None:
+    image, message = road(1280, 720)
+    columns = []
+    for offset_m in (-1.0, 0.0, 1.0):
+        bar = draw_lanes(image, in_meters(message, offset_m, DepartureModel(), 0.01))[16:46, 840:1105]
+        columns.append(float(np.nonzero((bar > 200).all(axis=2))[1].mean()))
+    assert np.diff(columns) == pytest.approx([57.0, 57.0], abs=2.0)
+
+
+def test_the_map_shows_the_road_and_its_uncertainty() -> None:
+    image, message = road(1280, 720)
+
+    def colored(variance: float) -> int:
+        part = draw_lanes(image, in_meters(message, 0.0, DepartureModel(), variance))[13:242, 1118:1267]
+        return int((np.ptp(part.astype(int), axis=2) > 30).sum())
+
+    assert 0 < colored(1e-6) < 0.5 * colored(0.25)
+    without = draw_lanes(image, message)[80:242, 1118:1267]
+    assert (without == 90).all()
 
 
 def test_no_lanes_and_unknown_positions_can_be_drawn() -> None:

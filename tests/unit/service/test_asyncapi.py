@@ -15,7 +15,12 @@ import yaml
 
 from lanestream.asyncapi import document
 from lanestream.protocol import (
+    CalibrationChangedModel,
+    CalibrationModel,
     CameraModel,
+    DepartureEventModel,
+    DepartureModel,
+    DepartureOptions,
     DrainingMessage,
     EgoModel,
     EndMessage,
@@ -26,10 +31,12 @@ from lanestream.protocol import (
     LanesMessage,
     LineModel,
     Message,
+    SceneCutModel,
     StartMessage,
     SummaryMessage,
     TimingModel,
     json_schemas,
+    warning_message,
 )
 
 ROOT = Path(__file__).parents[3]
@@ -47,6 +54,7 @@ LANE = LaneModel(
     covariance=[[1.0] * 3] * 3,
     age_s=0.1,
     ground=(0.0, 0.1, 1.8),
+    ground_covariance=[[1.0] * 3] * 3,
 )
 LANES = LanesMessage(
     seq=1,
@@ -55,17 +63,29 @@ LANES = LanesMessage(
     height=180,
     horizon=72.0,
     lanes=[LANE],
-    ego=EgoModel(left=3, right=None, offset=None),
-    events=[LaneChangeModel(track_id=3, direction="left")],
+    ego=EgoModel(left=3, right=None, offset=None, lateral_speed=-0.2, lateral_speed_sigma=0.1),
+    departure=DepartureModel(state="warning", side="left", time_to_crossing=0.8),
+    calibration=CalibrationModel(pitch=1.0, pitch_sigma=0.1, yaw=-1.0, yaw_sigma=0.1, settled=True),
+    events=[
+        LaneChangeModel(track_id=3, direction="left", timestamp=0.03),
+        DepartureEventModel(state="warning", side="left", track_id=3, timestamp=0.03),
+        SceneCutModel(timestamp=0.04),
+        CalibrationChangedModel(pitch=1.0, yaw=-1.0, timestamp=0.04),
+    ],
     dropped=0,
     timing_ms=TimingModel(decode=1, propose=1, queue=1, infer=1, track=1, total=5),
 )
 MESSAGES: list[Message] = [
-    StartMessage(mode="all", camera=CameraModel(height=1.4, field_of_view=62.0)),
-    FrameMessage(seq=7, timestamp=-0.5),
+    StartMessage(
+        mode="all",
+        camera=CameraModel(height=1.4, field_of_view=62.0),
+        departure=DepartureOptions(vehicle_width=1.9),
+    ),
+    FrameMessage(seq=7, timestamp=-0.5, speed=20.0, indicator="left"),
     EndMessage(),
     fakes.ready(),
     LANES,
+    warning_message("timestamps_not_advancing", 1),
     ErrorMessage(code="bad_image", message="m"),
     DrainingMessage(resume_token=None, deadline_s=10.0),
     SummaryMessage(frames=1, answered=1, failed=0, dropped=0, duration_s=1.0),
@@ -149,7 +169,7 @@ def test_the_examples_are_valid_messages() -> None:
 def test_the_json_schemas_name_all_messages() -> None:
     assert {"start", "frame", "end"} == set(json_schemas()["client"]["discriminator"]["mapping"])
     server = json_schemas()["server"]["discriminator"]["mapping"]
-    assert {"ready", "lanes", "error", "draining", "summary"} == set(server)
+    assert {"ready", "lanes", "warning", "error", "draining", "summary"} == set(server)
 
 
 def test_the_schemas_use_the_dialect_that_asyncapi_requires() -> None:

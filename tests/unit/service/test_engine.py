@@ -12,6 +12,7 @@ from lanestream.detection.detectors import DETECTORS
 from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, Engine, load_engine, resolve_regressor
 from lanestream.errors import ModelError, NoDetectorError
+from lanestream.session import SessionOptions
 
 
 def test_the_shipped_models_make_both_detectors() -> None:
@@ -36,7 +37,7 @@ def test_a_detector_without_its_model_is_left_out() -> None:
 def test_the_first_detector_is_the_default_and_a_missing_one_is_an_error() -> None:
     engine = fakes.two_detectors()
     assert (engine.select(), engine.select("regression")) == ("candidates", "regression")
-    for use in (engine.select, engine.main_model, lambda name: engine.open_session(detector=name)):
+    for use in (engine.select, engine.main_model, lambda name: engine.open_session(SessionOptions(detector=name))):
         with pytest.raises(NoDetectorError, match="there is no detector other here") as error:
             use("other")
         assert error.value.hint == "ask for candidates, regression"
@@ -44,7 +45,7 @@ def test_the_first_detector_is_the_default_and_a_missing_one_is_an_error() -> No
 
 def test_a_processed_frame_has_the_time_of_its_inference() -> None:
     engine = fakes.engine()
-    result = engine.process(engine.open_session(), fakes.picture(), 0.0)
+    result = engine.process(engine.open_session(SessionOptions(single_image=True)), fakes.picture(), 0.0)
     assert set(result.timing_ms) == {"propose", "fit", "track", "infer"}
     assert len(result.lanes) == 2
 

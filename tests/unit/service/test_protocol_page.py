@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import asdict
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from lanestream.asyncapi import document
 from lanestream.errors import ProtocolError, documented_errors
-from lanestream.protocol import MAX_SEQ, SUBPROTOCOL, Limits, parse_client_message, parse_server_message
+from lanestream.protocol import (
+    MAX_SEQ,
+    SUBPROTOCOL,
+    WARNINGS,
+    DepartureOptions,
+    EgoModel,
+    EventModel,
+    LaneModel,
+    Limits,
+    parse_client_message,
+    parse_server_message,
+)
 from lanestream.settings import Settings
 from lanestream.streaming.stream_protocol import StreamLimits
 
@@ -46,6 +59,36 @@ def test_the_table_of_close_codes_agrees_with_asyncapi() -> None:
     rows = dict(re.findall(r"^\| (\d+) \| (.*) \|$", PAGE, re.MULTILINE))
     closes = document()["channels"]["stream"]["x-close-codes"]
     assert {code: rows[code].replace("`max_bytes`", "the size limit of an image") for code in closes} == closes
+
+
+def rows(header: str) -> dict[str, list[str]]:
+    """Returns the rows of the table with this header: the other cells by the name in the first."""
+    lines = PAGE.split(f"\n{header}\n")[1].split("\n\n")[0].splitlines()[1:]
+    cells = [line.strip("| ").split(" | ") for line in lines]
+    return {first.strip("`"): rest for first, *rest in cells}
+
+
+def test_the_tables_of_results_are_complete() -> None:
+    assert set(rows("| state | |")) == set(get_args(LaneModel.model_fields["state"].annotation))
+    ego = {name for name in EgoModel.model_fields if not name.endswith("_sigma")}
+    assert set(rows("| field | | needs |")) == ego - {"left", "right"}
+    assert {f"{name}_sigma" for name in rows("| field | | needs |")} <= set(EgoModel.model_fields)
+    events = {
+        event.model_fields["type"].default: set(event.model_fields) - {"type", "timestamp"}
+        for event in get_args(EventModel)
+    }
+    described = {
+        name: set(re.findall(r"`(\w+)`", fields)) for name, (fields, *_) in rows("| event | fields | |").items()
+    }
+    assert described == events
+
+
+def test_the_tables_of_warnings_and_departures_are_complete() -> None:
+    warnings = {code: meaning.split(";")[0] for code, (meaning,) in rows("| code | |").items()}
+    assert warnings == {code: message for code, (message, _) in WARNINGS.items()}
+    options = {name: float(default) for name, (default, _) in rows("| field | default | |").items()}
+    assert options == asdict(Settings().departure_settings)
+    assert set(options) == set(DepartureOptions.model_fields)
 
 
 def test_the_numbers_are_the_defaults() -> None:

@@ -15,7 +15,10 @@ from pydantic_core import PydanticUndefined
 from lanestream.errors import SettingsError
 from lanestream.host import processors
 from lanestream.keys import ApiKey
+from lanestream.protocol import DepartureOptions
+from lanestream.session import SessionOptions
 from lanestream.settings import Settings, load_settings, to_toml
+from lanestream.tracking.departure import DepartureSettings
 
 OPERATIONS = Path(__file__).parents[3] / "docs" / "operations.md"
 DIGEST = "0123456789abcdef" * 4
@@ -47,6 +50,16 @@ def test_limits_follow_from_the_settings(monkeypatch: pytest.MonkeyPatch) -> Non
     assert (settings.port, settings.credits, settings.host, settings.model) == (82, 3, "127.0.0.1", None)
     assert (settings.threads_per_process(1), settings.threads_per_process(2)) == (processors() + 1, 1)
     assert settings.image_limits.max_bytes == settings.max_bytes
+
+
+def test_departure_warnings_have_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Settings().departure_settings == DepartureSettings()
+    monkeypatch.setenv("LANESTREAM_DEPARTURE_VEHICLE_WIDTH", "2.5")
+    monkeypatch.setenv("LANESTREAM_DEPARTURE_LEAST_SPEED", "0")
+    defaults = load_settings().departure_settings
+    assert defaults == DepartureSettings(vehicle_width=2.5, least_speed=0.0)
+    options = SessionOptions.of(None, None, None, DepartureOptions(vehicle_width=1.9), defaults)
+    assert options.departure == DepartureSettings(vehicle_width=1.9, least_speed=0.0)
 
 
 def test_a_variable_can_name_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,9 +26,10 @@ from lanestream.images.decoding import ImageLimits
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.protocol import StartMessage
 from lanestream.road.results import FrameResult
-from lanestream.session import Session
+from lanestream.session import Session, SessionOptions
 from lanestream.streaming.session_registry import Caller, OpenSession, SessionLimits, SessionRegistry
 from lanestream.streaming.store import MemoryStore, SessionStore, StoredSession, TakenSession
+from lanestream.tracking.road_filter import OWN, ROAD
 from lanestream.workers.thread_pool import ThreadPool
 
 ANN, BOB = Caller("ann", "ann"), Caller("bob", "bob")
@@ -126,9 +127,14 @@ def process_frame(session: OpenSession, timestamp: float) -> FrameResult:
     return fakes.engine().process(session.handle, fakes.picture(), timestamp)
 
 
+# The numbers of a filter of two boundaries: its mean and half of its covariance.
+SIZE: Final = ROAD + 2 * OWN
+NUMBERS: Final = SIZE + SIZE * (SIZE + 1) // 2
+
+
 def encoded(numbers: NDArray[np.float64]) -> str:
     """Returns the numbers of a filter as a record has them."""
-    return b64encode(numbers.astype("<f8").tobytes()).decode()
+    return b64encode(numbers.astype("<f4").tobytes()).decode()
 
 
 def valid_record() -> dict[str, Any]:
@@ -408,7 +414,7 @@ async def test_sessions_are_limited_in_total_and_per_caller() -> None:
 async def test_a_detector_that_is_not_loaded_opens_no_session() -> None:
     registry = make_registry(sessions=1)
     with pytest.raises(NoDetectorError):
-        await registry.start(POOL, ANN, StartMessage(detector="regression"))
+        await registry.start(POOL, ANN, StartMessage(), SessionOptions(detector="regression"))
     await start(registry)
 
 
@@ -613,28 +619,24 @@ async def test_sessions_are_limited_in_rate_per_caller() -> None:
     ("path", "value", "reason"),
     [
         (("size",), [640, 0], "side of the images"),
+        (("size",), [640, 480], "does not fit the size of the images"),
+        (("size",), None, "does not fit the size of the images"),
         (("horizon",), 1.5, "horizon is 1.5; expected -1 to 0.98"),
         (("evidence",), -1.0, "evidence"),
-        (("tracker", "rows"), [300.0, 300.0, 300.0], "tracked rows"),
-        (("tracker", "rows"), [200.0, 250.0, 300.0], "tracked rows"),
-        (("tracker", "rows"), None, "rows or their horizon are missing"),
+        (("departure", "side"), "left", "a departure has a side exactly if"),
+        (("departure", "right", "margin"), 1e7, "departure margin"),
         (("tracker", "lane_width"), 0.0, "lane_width is 0.0"),
         (("tracker", "next_id"), 1, "track_id is 1"),
         (("tracker", "next_id"), 10**40, "next_id is 1000"),
-        (("tracker", "clock"), -1.0, "clock is -1.0"),
+        (("tracker", "clock", "now"), -1.0, "clock is -1.0"),
         (("tracker", "frames"), -1, "frames"),
-        (("tracker", "tracks", 1, "track_id"), 1, "the same id"),
-        (("tracker", "tracks", 0, "track_id"), -1, "track_id is -1"),
-        (("tracker", "tracks", 0, "born"), 5.0, "born is 5.0"),
-        (("tracker", "tracks", 0, "probability"), 2.0, "probability"),
-        (("tracker", "tracks", 0, "top"), 1e5, "top"),
-        (("tracker", "tracks", 0, "hits"), [], "number of hits is 0"),
-        (("tracker", "tracks", 0, "side"), 0, "side"),
-        (("tracker", "tracks", 0, "filter"), "!", "not valid base 64"),
-        (("tracker", "tracks", 0, "filter"), "AAAA", "has 3 bytes; expected 336"),
-        (("tracker", "tracks", 0, "filter"), encoded(np.full(42, np.nan)), "not finite"),
-        (("tracker", "tracks", 0, "filter"), encoded(np.arange(42.0)), "not symmetric"),
-        (("tracker", "tracks", 0, "filter"), encoded(np.append(np.zeros(6), -np.eye(6))), "positive semidefinite"),
+        (("tracker", "tracks"), "!", "not valid base 64"),
+        (("tracker", "tracks"), "", "which are not those of 0 tracks"),
+        (("tracker", "filter"), "AAAA", "has 3 bytes; expected a multiple of 4"),
+        (("tracker", "filter"), encoded(np.full(NUMBERS, np.nan)), "not finite"),
+        (("tracker", "filter"), encoded(np.append(np.zeros(SIZE), np.full(NUMBERS - SIZE, -1.0))), "negative variance"),
+        (("tracker", "filter"), encoded(np.arange(float(NUMBERS))), "positive semidefinite"),
+        (("scene", "thumbnail"), "AAAA", "has 3 bytes; expected 144"),
     ],
 )
 async def test_an_invalid_state_starts_over(
@@ -663,12 +665,12 @@ NONSENSE = (
 
 def changed(value: object) -> st.SearchStrategy[object]:
     """Returns values to replace `value` of a record with: nonsense, or almost right."""
-    if isinstance(value, str) and len(value) == len(encoded(np.zeros(42))):
-        numbers = np.frombuffer(b64decode(value))
-        factors = st.just(0.0) | st.floats(1e-12, 1e12) | st.floats()
-        return NONSENSE | st.tuples(st.lists(st.integers(0, 41)), factors).map(
+    if isinstance(value, str) and len(value) == len(encoded(np.zeros(NUMBERS))):
+        numbers, every = np.frombuffer(b64decode(value), "<f4").astype(float), np.arange(NUMBERS)
+        factors = st.just(0.0) | st.floats(1e-12, 1e12) | st.floats(width=32)
+        return NONSENSE | st.tuples(st.lists(st.integers(0, NUMBERS - 1)), factors).map(
             lambda change: encoded(
-                numbers * np.where(np.isin(np.arange(42), change[0] or np.arange(42)), change[1], 1.0)
+                (numbers * np.where(np.isin(every, change[0] or every), change[1], 1.0)).clip(-3e38, 3e38)
             )
         )
     if isinstance(value, float):

@@ -9,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanestream.errors import IdleError, OverrunError, ProtocolError
-from lanestream.protocol import DrainingMessage, EndMessage, ErrorMessage, FrameMessage, Mode, StartMessage
+from lanestream.protocol import (
+    WARNINGS,
+    DrainingMessage,
+    EndMessage,
+    ErrorMessage,
+    FrameMessage,
+    Mode,
+    StartMessage,
+    WarningCode,
+    WarningMessage,
+)
 from lanestream.streaming.stream_protocol import (
     FrameOutcome,
     IncomingFrame,
@@ -17,6 +27,7 @@ from lanestream.streaming.stream_protocol import (
     StreamProtocol,
     StreamState,
 )
+from lanestream.tracking.departure import VehicleMotion
 
 
 def open_stream(mode: Mode, credit_limit: int = 3) -> StreamProtocol:
@@ -63,6 +74,29 @@ def test_missing_numbers_and_times_are_assigned() -> None:
         taken.append((frame.seq, round(frame.timestamp, 3), frame.data, frame.arrived))
         protocol.complete_frame(FrameOutcome.ANSWERED, 102.0)
     assert taken == [(0, 0.5, b"a", 100.5), (42, 0.6, b"b", 100.6), (43, 0.75, b"c", 100.75)]
+
+
+def test_a_frame_has_the_motion_that_was_announced_with_it() -> None:
+    protocol = open_stream("all")
+    protocol.receive_message(FrameMessage(speed=24.5, indicator="left"), 101.0)
+    protocol.receive_image(b"a", 101.0)
+    protocol.receive_image(b"b", 101.0)
+    motions = []
+    for _ in range(2):
+        frame = protocol.take_frame()
+        assert frame is not None
+        motions.append(frame.motion)
+        protocol.complete_frame(FrameOutcome.ANSWERED, 102.0)
+    assert motions == [VehicleMotion(24.5, "left"), VehicleMotion()]
+
+
+@pytest.mark.parametrize("code", WARNINGS)
+def test_a_warning_is_sent_with_its_text(code: WarningCode) -> None:
+    protocol = open_stream("all")
+    protocol.warn(code, 3)
+    (message,) = protocol.messages_to_send()
+    assert isinstance(message, WarningMessage)
+    assert (message.code, message.message, message.hint, message.seq) == (code, *WARNINGS[code], 3)
 
 
 def test_one_frame_is_processed_at_a_time() -> None:

@@ -31,6 +31,10 @@ from lanestream.errors import (
 )
 from lanestream.images.decoding import ImageLimits
 from lanestream.messages import ProcessedFrame
+from lanestream.protocol import CameraModel
+from lanestream.road.results import DepartureEvent
+from lanestream.session import SessionOptions
+from lanestream.tracking.departure import VehicleMotion
 from lanestream.workers.admission import Slot
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame
@@ -43,6 +47,8 @@ from lanestream.workers.worker_main import portable
 LIMITS = ImageLimits()
 LOG: dict[str, Any] = {"version": 1}
 # Restarts without the pauses of real operation.
+# A session that reports every boundary at once.
+SINGLE = SessionOptions(single_image=True)
 SOON = RestartPolicy(first_s=0.01, longest_s=0.05)
 
 
@@ -71,7 +77,7 @@ async def run(
     pool: WorkerPool, data: bytes | None = None, slot: Slot | None = None, timestamp: float = 0.0
 ) -> ProcessedFrame:
     """Processes one frame of a new session."""
-    return await pool.run(pool.open_session(), frame(data, timestamp), slot or Slot())
+    return await pool.run(pool.open_session(SINGLE), frame(data, timestamp), slot or Slot())
 
 
 async def outcomes(pool: WorkerPool, frames: list[bytes]) -> list[type]:
@@ -110,21 +116,44 @@ async def test_lanes_and_states_are_exactly_those_of_threads() -> None:
     await threads.close()
 
 
+async def departures(pool: WorkerPool) -> list[DepartureEvent]:
+    """Returns the departures of a vehicle that leaves its lane, in a new session of `fakes.drifting_engine`."""
+    session = pool.open_session(SessionOptions.of(None, None, CameraModel(height=1.4, field_of_view=62.0)))
+    found: list[DepartureEvent] = []
+    for number in range(80):
+        motion = VehicleMotion(speed=30.0)
+        encoded = EncodedFrame(fakes.image_file(), 0.04 * number, time.monotonic(), motion=motion)
+        processed = await pool.run(session, encoded, Slot())
+        found += [event for event in processed.result.events if isinstance(event, DepartureEvent)]
+    return found
+
+
+async def test_departures_are_the_same_as_in_threads() -> None:
+    threads = ThreadPool(fakes.drifting_engine(), LIMITS, threads=1)
+    async with started(fakes.drifting_engine) as processes:
+        found = await departures(processes)
+    assert [event.state for event in found] == ["warning", "crossed"]
+    assert found == await departures(threads)
+    await threads.close()
+
+
 async def test_the_capabilities_are_those_of_the_workers() -> None:
     async with started(fakes.two_detectors) as pool:
         assert [info.detector for info in pool.capabilities.detectors] == ["candidates", "regression"]
         assert pool.capabilities.select("regression").model.name == "other 2"
-        processed = await pool.run(pool.open_session(detector="regression"), frame(), Slot())
+        processed = await pool.run(
+            pool.open_session(SessionOptions(detector="regression", single_image=True)), frame(), Slot()
+        )
         assert len(processed.result.lanes) == 1
     async with started(fakes.engine) as pool:
         with pytest.raises(NoDetectorError, match="there is no detector regression here"):
-            pool.open_session(detector="regression")
+            pool.open_session(SessionOptions(detector="regression"))
 
 
 async def test_errors_are_raised_and_leave_the_session_as_it_was() -> None:
     reports: list[object] = []
     async with started(fakes.engine, observe=reports.append) as pool:
-        session = pool.open_session()
+        session = pool.open_session(SINGLE)
         await pool.run(session, frame(), Slot())
         before = session.state
         with pytest.raises(ImageError, match="it looks like text") as refused:
@@ -170,7 +199,7 @@ async def test_a_worker_that_hangs_is_ended_and_replaced(caplog: pytest.LogCaptu
 
 async def test_a_service_that_was_suspended_keeps_its_workers() -> None:
     async with started(fakes.engine, frame_s=1.0) as pool:
-        session = pool.open_session()
+        session = pool.open_session(SINGLE)
         (first,) = pool.pids
         os.kill(first, signal.SIGSTOP)
         processed = asyncio.create_task(pool.run(session, frame(), Slot()))

@@ -17,6 +17,7 @@ from lanestream.errors import ExpiredError, NoDetectorError
 from lanestream.images.decoding import ImageLimits
 from lanestream.messages import ProcessedFrame
 from lanestream.road.view import Image
+from lanestream.session import DEFAULT_SESSION, SessionOptions
 from lanestream.workers.admission import Slot
 from lanestream.workers.capabilities import Capabilities
 from lanestream.workers.frame_worker import EncodedFrame
@@ -51,7 +52,7 @@ class IdlePool(WorkerPool):
     def __init__(self, workers: int, threads: int) -> None:
         super().__init__(Capabilities.of(fakes.engine()), workers, threads, 1)
 
-    def open_session(self, horizon: float | None = None, detector: str | None = None) -> SessionHandle:
+    def open_session(self, options: SessionOptions = DEFAULT_SESSION) -> SessionHandle:
         raise NotImplementedError
 
     async def run(self, session: SessionHandle, frame: EncodedFrame, slot: Slot) -> ProcessedFrame:
@@ -64,8 +65,11 @@ def encoded(timestamp: float = 0.0, deadline: float | None = None) -> EncodedFra
 
 async def run_together(model: CountingModel, threads: int, cameras: int) -> list[ProcessedFrame]:
     """Returns the results of one frame of each camera, all given to the pool at the same time."""
-    pool = ThreadPool(fakes.engine(model, ShadeDetector()), ImageLimits(), threads)
-    frames = await asyncio.gather(*(pool.run(pool.open_session(), encoded(), Slot()) for _ in range(cameras)))
+    pool, single = (
+        ThreadPool(fakes.engine(model, ShadeDetector()), ImageLimits(), threads),
+        SessionOptions(single_image=True),
+    )
+    frames = await asyncio.gather(*(pool.run(pool.open_session(single), encoded(), Slot()) for _ in range(cameras)))
     await pool.close()
     return frames
 
@@ -106,7 +110,7 @@ async def test_an_expired_frame_is_never_run_and_leaves_the_session_as_it_was() 
 async def test_a_detector_that_is_missing_is_an_error() -> None:
     pool = ThreadPool(fakes.engine(), ImageLimits(), 1)
     with pytest.raises(NoDetectorError, match="there is no detector regression here"):
-        pool.open_session(detector="regression")
+        pool.open_session(SessionOptions(detector="regression"))
     assert (pool.works, pool.pids) == (True, ())
     await pool.close()
 

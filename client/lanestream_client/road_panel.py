@@ -1,0 +1,191 @@
+"""The panel of an overlay: the vehicle in its lane, its departure from it, and the road from above, in meters.
+
+Bands show 95 % intervals.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from lanestream.errors import needs_extra
+from lanestream_client.canvas import ALERT, CAUTION, WHITE, Canvas, Color, dashes, position_color
+
+with needs_extra("video"):
+    import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from lanestream.protocol import DepartureModel, EgoModel, LaneModel, LanesMessage
+
+    FloatArray = NDArray[np.float64]
+
+# All sizes are in pixels of an image 1280 pixels wide.
+_STEP: Final = 26.0
+_WIDTH: Final = 262.0
+_MAP_WIDTH: Final = 150.0
+_MAP_HEIGHT: Final = 230.0
+# In narrower images, there is no room beside the legend.
+_LEAST_WIDTH: Final = 700.0
+# The part of the road that the map shows in meters: ahead, behind and on either side of the vehicle.
+_AHEAD_M: Final = 45.0
+_BEHIND_M: Final = 5.0
+_SIDE_M: Final = 7.0
+_GRID_M: Final = (10.0, 20.0, 30.0, 40.0)
+_VEHICLE_M: Final = (4.4, 1.8)
+_SAMPLES: Final = 48
+# A normal distribution has 95 % within this many sigmas.
+_SIGMAS: Final = 1.96
+# A wider lane half than this many lane widths is cut off on the offset bar.
+_BAR_LANES: Final = 0.62
+# Weaker curvatures, in 1/m, count as straight.
+_STRAIGHT: Final = 1.0 / 3000.0
+_GRAY: Final[Color] = (150, 150, 150)
+
+
+def draw_road_panel(canvas: Canvas, message: LanesMessage) -> None:
+    """Draws the panel at the top right, and the map of the road beside it if the camera is known.
+
+    Draws nothing on an image that is too narrow.
+    """
+    if canvas.image.shape[1] < _LEAST_WIDTH * canvas.scale:
+        return
+    right = canvas.image.shape[1] - _STEP / 2.0 * canvas.scale
+    grounds = [lane for lane in message.lanes if lane.ground is not None]
+    if grounds:
+        width, height = _MAP_WIDTH * canvas.scale, _MAP_HEIGHT * canvas.scale
+        right -= width
+        part = canvas.part(right, _STEP / 2.0 * canvas.scale, width, height)
+        part.darken()
+        _draw_map(part, grounds)
+        right -= 0.4 * _STEP * canvas.scale
+    if message.ego.offset is not None or message.departure is not None:
+        _draw_readings(canvas, right, message.ego, message.departure)
+
+
+def _draw_readings(canvas: Canvas, right: float, ego: EgoModel, departure: DepartureModel | None) -> None:
+    """Draws the offset bar and lines of text that end at the column `right`."""
+    step, width = _STEP * canvas.scale, _WIDTH * canvas.scale
+    texts = [(_offset_text(ego), WHITE), *((text, WHITE) for text in _road_texts(ego))]
+    if departure is not None:
+        texts.append(_departure_text(departure))
+    part = canvas.part(right - width, step / 2.0, width, (1.4 + len(texts)) * step)
+    part.darken()
+    color = WHITE if departure is None else _departure_text(departure)[1]
+    if ego.offset is not None:
+        _draw_offset_bar(part, ego.offset, ego.offset_sigma or 0.0, color)
+    for line, (text, text_color) in enumerate(texts, 2):
+        part.text(text, (0.5 * step, (line - 0.1) * step), text_color, 0.5)
+
+
+def _draw_offset_bar(canvas: Canvas, offset: float, sigma: float, color: Color) -> None:
+    """Draws the lane as a bar between its boundaries, and the vehicle's middle at `offset` lane widths in it."""
+    step, width = _STEP * canvas.scale, _WIDTH * canvas.scale
+    middle, lane = 0.7 * step, 0.78 * width
+
+    def column(share: float) -> float:
+        return width / 2.0 + min(max(share, -_BAR_LANES), _BAR_LANES) * lane
+
+    canvas.rectangle(column(-0.5), middle - 0.06 * step, lane, 0.12 * step, _GRAY)
+    for edge, position in ((-0.5, -1), (0.5, 1)):
+        canvas.rectangle(
+            column(edge) - 0.09 * step, middle - 0.35 * step, 0.18 * step, 0.7 * step, position_color(position)
+        )
+    start, end = column(offset - _SIGMAS * sigma), column(offset + _SIGMAS * sigma)
+    canvas.rectangle(start, middle - 0.12 * step, end - start, 0.24 * step, color)
+    at = column(offset)
+    canvas.polygon(
+        np.array(
+            [
+                [at, middle - 0.42 * step],
+                [at + 0.24 * step, middle],
+                [at, middle + 0.42 * step],
+                [at - 0.24 * step, middle],
+            ]
+        ),
+        color,
+    )
+
+
+def _offset_text(ego: EgoModel) -> str:
+    if ego.offset_m is not None:
+        return f"offset {abs(ego.offset_m):.2f} m {_side(ego.offset_m, 0.005)}"
+    if ego.offset is not None:
+        return f"offset {100.0 * abs(ego.offset):.0f} % {_side(ego.offset, 0.005)}"
+    return "offset unknown"
+
+
+def _side(value: float, least: float) -> str:
+    return "" if abs(value) < least else "right" if value > 0.0 else "left"
+
+
+def _road_texts(ego: EgoModel) -> list[str]:
+    """Returns the lane width and the radius of the road, as far as they are known."""
+    texts = []
+    if ego.lane_width_m is not None:
+        texts.append(f"lane width {ego.lane_width_m:.2f} m")
+    if ego.curvature is not None:
+        if abs(ego.curvature) < _STRAIGHT:
+            texts.append("straight")
+        else:
+            texts.append(f"radius {1.0 / abs(ego.curvature):.0f} m {_side(-ego.curvature, 0.0)}")
+    return texts
+
+
+def _departure_text(departure: DepartureModel) -> tuple[str, Color]:
+    """Returns the word for a departure and its color."""
+    if departure.state == "none":
+        return "in lane", WHITE
+    if departure.state == "crossed":
+        return f"LINE CROSSED {departure.side}".upper(), ALERT
+    time_s = departure.time_to_crossing
+    return f"DEPARTURE {departure.side}".upper() + ("" if time_s is None else f" {time_s:.1f} s"), CAUTION
+
+
+def _draw_map(canvas: Canvas, lanes: list[LaneModel]) -> None:
+    """Draws boundaries from above on the whole canvas, ahead is up, with their uncertainty as bands."""
+    height, width = canvas.image.shape[:2]
+    for distance in _GRID_M:
+        canvas.line(
+            _map_points(np.array([distance] * 2), np.array([-_SIDE_M, _SIDE_M]), width, height), (80, 76, 72), 1.0
+        )
+        if distance in _GRID_M[1::2]:
+            (at,) = _map_points(np.array([distance]), np.array([_SIDE_M]), width, height)
+            canvas.text(f"{distance:.0f} m", (at[0] + 3.0 * canvas.scale, at[1] - 3.0 * canvas.scale), _GRAY, 0.36)
+    for lane in lanes:
+        _draw_band(canvas, lane)
+    for lane in lanes:
+        color = position_color(lane.position)
+        for piece in dashes(lane.state):
+            x = np.linspace(*(piece[0] * _AHEAD_M, piece[1] * _AHEAD_M), _SAMPLES)
+            canvas.line(_map_points(x, _lateral(lane, x), width, height), color, 2.0)
+    length, breadth = _VEHICLE_M
+    corners = np.array([[-length, breadth], [0.0, breadth], [0.0, -breadth], [-length, -breadth]]) / np.array(
+        [1.0, 2.0]
+    )
+    canvas.polygon(_map_points(corners[:, 0], corners[:, 1], width, height), WHITE)
+
+
+def _draw_band(canvas: Canvas, lane: LaneModel) -> None:
+    if lane.ground_covariance is None:
+        return
+    x = np.linspace(0.0, _AHEAD_M, _SAMPLES)
+    powers = np.column_stack([x**2, x, np.ones_like(x)])
+    variance = np.einsum("ni,ij,nj->n", powers, np.array(lane.ground_covariance), powers)
+    half = np.minimum(_SIGMAS * np.sqrt(np.maximum(variance, 0.0)), 2.0 * _SIDE_M)
+    y = _lateral(lane, x)
+    height, width = canvas.image.shape[:2]
+    outline = np.vstack([_map_points(x, y + half, width, height), _map_points(x, y - half, width, height)[::-1]])
+    canvas.polygon(outline, position_color(lane.position), opacity=0.35)
+
+
+def _lateral(lane: LaneModel, x: FloatArray) -> FloatArray:
+    """Returns how far left of the vehicle a boundary is at the distances `x`, all in meters."""
+    assert lane.ground is not None  # noqa: S101 - only lanes in meters are drawn
+    a, b, c = lane.ground
+    return np.clip(a * x**2 + b * x + c, -4.0 * _SIDE_M, 4.0 * _SIDE_M)
+
+
+def _map_points(x: FloatArray, y: FloatArray, width: int, height: int) -> FloatArray:
+    """Returns the pixels (N, 2) of points in the vehicle frame: x ahead, y to the left, in meters."""
+    return np.column_stack([width * (0.5 - 0.5 * y / _SIDE_M), height * (_AHEAD_M - x) / (_AHEAD_M + _BEHIND_M)])

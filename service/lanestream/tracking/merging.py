@@ -1,0 +1,50 @@
+"""Merging: of tracks that follow one marking, the oldest keeps its identity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from lanestream.road.curve import FloatArray
+from lanestream.tracking.tracks import FRAMES, HITS, Track
+
+# Tracks closer than the first, in lane widths, follow one marking. A track takes over the place of one that is closer
+# than the second after the usual number of hits, of one farther away after as many hits in a row as are remembered.
+SAME: Final = 0.35
+_NEAR: Final = 0.2
+
+
+@dataclass(frozen=True)
+class Survivor:
+    """A track that is kept, with the place of the track `slot`, which is another one if it took that over.
+
+    A `contested` track is tentative, and near a confirmed one that coasts: it may be where that boundary is now.
+    """
+
+    track: int
+    slot: int
+    contested: bool = False
+
+
+def merge(tracks: Sequence[Track], positions: FloatArray, lane_width: float) -> list[Survivor]:
+    """Returns the tracks that are kept, in order; those that took over a place continue with its support, too.
+
+    `positions` (N, R) and `lane_width` are in row offsets, at R rows.
+    """
+    order = sorted(range(len(tracks)), key=lambda i: (not tracks[i].confirmed, tracks[i].born, tracks[i].track_id or 0))
+    survivors: dict[int, Survivor] = {}
+    for i in order:
+        gaps = {j: float(np.abs(positions[i] - positions[j]).max()) / lane_width for j in survivors}
+        older = min((j for j in gaps if gaps[j] < SAME), key=gaps.__getitem__, default=None)
+        if older is None:
+            survivors[i] = Survivor(i, i)
+        elif not tracks[older].hits[-1]:
+            if sum(tracks[i].hits) >= (HITS if gaps[older] < _NEAR else FRAMES):
+                tracks[older].take_over(tracks[i])
+                survivors[older] = Survivor(older, i)
+            elif not tracks[i].confirmed:
+                survivors[i] = Survivor(i, i, contested=True)
+    return [survivors[i] for i in sorted(survivors)]
