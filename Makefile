@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: attack bench soak evaluate ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -61,6 +61,10 @@ evaluate: $(DEV_READY)
 	$(BIN)/lanestream evaluate --split test --model $(MODELS)/classifier.onnx --model $(MODELS)/regressor.onnx \
 	  --out out --json out/evaluation.json
 	$(BIN)/python tools/evaluation_tables.py out/evaluation.json
+
+# Takes hours. ARGS='--against DIR' compares with another checkout.
+evaluate-tracking: $(DEV_READY)
+	$(BIN)/lanestream evaluate tracking --real -o out/tracking.json --plots out/tracking $(ARGS)
 
 # Leaves out each stage of the candidate detector once; results are kept in out/, so that it can be interrupted.
 ablation: $(DEV_READY)

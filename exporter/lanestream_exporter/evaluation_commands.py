@@ -1,14 +1,15 @@
-"""The commands `evaluate` and `score`."""
+"""The commands `evaluate`, `evaluate tracking` and `score`."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 
 from lanestream.engine import SHIPPED_MODEL, load_engine, resolve_regressor
@@ -22,15 +23,23 @@ from lanestream_exporter.evaluation.measuring import EvaluationSet, run_evaluati
 from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
 from lanestream_exporter.evaluation.score import score_results
 from lanestream_exporter.evaluation.tables import figure_tables
+from lanestream_exporter.evaluation.tracking.figures import all_figures
+from lanestream_exporter.evaluation.tracking.real import real_clips, run_real
+from lanestream_exporter.evaluation.tracking.rendered import RenderedSet, run_rendered
+from lanestream_exporter.evaluation.tracking.systems import AGAINST, PRESENT, SystemSpec
+from lanestream_exporter.evaluation.tracking.tables import tracking_tables
+from lanestream_exporter.scenes.tracking_clips import KINDS
 
 if TYPE_CHECKING:
     from lanestream_exporter.datasets.splits import Split
 
 _REGRESSOR: Final = "Regressor whose ego-lane prior the classifiers use, or `none`.  [default: the shipped one]"
-_MIN_WIDTH: Final = 100  # columns of the tables, even if the terminal has fewer
+# Columns of the tables, even if the terminal has fewer.
+_MIN_WIDTH: Final = 100
+_MIN_TRACKING_WIDTH: Final = 150
 
 
-@click.command()
+@click.group(invoke_without_command=True)
 @click.option(
     "--model",
     "models",
@@ -55,7 +64,9 @@ _MIN_WIDTH: Final = 100  # columns of the tables, even if the terminal has fewer
 @click.option(
     "--format", "format_name", type=click.Choice([AUTO, *FORMATS]), default=AUTO, help="The format of your labels."
 )
+@click.pass_context
 def evaluate(
+    context: click.Context,
     models: Sequence[Path],
     regressor: Path | None,
     split: Split,
@@ -70,6 +81,9 @@ def evaluate(
     Figures are for candidates (level A), boundaries of single images and of clips (B), and the field's metrics (C);
     docs/evaluation.md describes each. A folder of labeled frames given with --data is evaluated as single images.
     """
+    if context.invoked_subcommand is not None:
+        _refuse_options(context)
+        return
     evaluation_set = _evaluation_set(data, manifest, format_name, split)
     evaluation = run_evaluation(
         _methods(models, regressor), evaluation_set, lambda stage: click.echo(f"measuring {stage} ...", err=True)
@@ -84,9 +98,77 @@ def evaluate(
 
             click.echo(f"report: {write_report(out, evaluation, figures)}")
     if json_path is not None:
-        with _writing(json_path):
-            json_path.parent.mkdir(parents=True, exist_ok=True)
-            json_path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        _write_json(json_path, figures)
+
+
+@evaluate.command("tracking")
+@click.option(
+    "--rendered", "clips", type=click.IntRange(0), default=24, show_default=True, help="Rendered clips of each kind."
+)
+@click.option(
+    "--seeds", "first_seed", type=click.IntRange(0), default=1000, show_default=True, metavar="FIRST",
+    help="Seed of the first clip of each kind; no choice is made on those from 1000 on.",
+)  # fmt: skip
+@click.option(
+    "--kind", "kinds", type=click.Choice(list(KINDS)), multiple=True, metavar="KIND",
+    help=f"Kind of rendered clips; may be repeated: {', '.join(KINDS)}.  [default: all]",
+)  # fmt: skip
+@click.option("--calibrate", is_flag=True, help="Let the systems estimate the camera's pitch and yaw.")
+@click.option("--real", is_flag=True, help="Evaluate the labeled real clips of the manifest, too.")
+@click.option("--held-out", is_flag=True, help="With --real: also the frames that no choice was made on.")
+@click.option("--model", type=click.Path(path_type=Path), help="ONNX file.  [default: the shipped classifier]")
+@click.option(
+    "--against", type=click.Path(path_type=Path), metavar="CHECKOUT",
+    help="Source tree of this project to compare with, of any version since 0.9.0.",
+)  # fmt: skip
+@click.option("--against-model", type=click.Path(path_type=Path), help="ONNX file to compare with, or for --against.")
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes for rendered clips.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Write all figures to this JSON file.")
+@click.option("--plots", type=click.Path(path_type=Path), metavar="DIR", help="Write plots of rendered clips to DIR.")
+@click.option(
+    "--data", type=click.Path(path_type=Path),
+    help="Folder that the paths of the manifest count from.  [default: $LANESTREAM_DATA]",
+)  # fmt: skip
+@click.option("--manifest", type=click.Path(path_type=Path), help="Manifest of real clips.  [default: the shipped one]")
+def evaluate_tracking(
+    clips: int,
+    first_seed: int,
+    kinds: tuple[str, ...],
+    calibrate: bool,
+    real: bool,
+    held_out: bool,
+    model: Path | None,
+    against: Path | None,
+    against_model: Path | None,
+    jobs: int,
+    out: Path | None,
+    plots: Path | None,
+    data: Path | None,
+    manifest: Path | None,
+) -> None:
+    """Measure tracking on rendered clips with exact truth, and on real clips.
+
+    With --against or --against-model, two systems get the same frames: this code with --model, and the other one.
+    docs/evaluation.md describes each figure.
+    """
+    specs = [SystemSpec(PRESENT, None, model)]
+    if against is not None or against_model is not None:
+        specs.append(SystemSpec(AGAINST, against, against_model))
+    rendered = RenderedSet(kinds or tuple(KINDS), range(first_seed, first_seed + clips), calibrate)
+    systems = {spec.name: spec.describe() for spec in specs}
+    real_set = real_clips(DatasetCollection.open(manifest, data), held_out) if real else []
+    runs = run_rendered(specs, rendered, jobs, _progress)
+    figures = all_figures(systems, rendered, runs, run_real(specs, real_set, _progress))
+    console = Console(width=max(_MIN_TRACKING_WIDTH, Console().width))
+    for table in tracking_tables(figures):
+        console.print(table)
+    if out is not None:
+        _write_json(out, figures)
+    if plots is not None and rendered.clips:
+        with needs_extra("train"), _writing(plots):
+            from lanestream_exporter.evaluation.tracking.plots import write_plots
+
+            write_plots(plots, figures, runs)
 
 
 @click.command()
@@ -104,6 +186,24 @@ def _evaluation_set(data: Path | None, manifest: Path | None, format_name: str, 
         return EvaluationSet.of_split(datasets, split)
     name = format_of(DataFolder.at(data), format_name)
     return EvaluationSet(data.name, lambda: read_dataset(data, name))
+
+
+def _refuse_options(context: click.Context) -> None:
+    """Raises UsageError if options of `evaluate` itself were given before a subcommand, which does not use them."""
+    for option in context.command.params:
+        if option.name and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE:
+            problem = f"{option.opts[-1]} is an option of `evaluate`, not of `evaluate {context.invoked_subcommand}`"
+            raise click.UsageError(problem, context)
+
+
+def _progress(stage: str) -> None:
+    click.echo(f"measured {stage}", err=True)
+
+
+def _write_json(path: Path, figures: Mapping[str, Any]) -> None:
+    with _writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 
 
 @contextmanager

@@ -143,7 +143,7 @@ def run_evaluation(
 def _track(methods: Sequence[Method], clip: LabeledClip) -> dict[str, ClipRun]:
     runs = {method.name: ClipRun() for method in methods}
     trackers = {method.name: method.start_clip() for method in methods}
-    for index, image, timestamp in _decoded(clip.video, clip.frames):
+    for index, image, timestamp in decoded_frames(clip.video, clip.frames):
         for method in methods:
             run = runs[method.name]
             found = trackers[method.name](image, timestamp)
@@ -155,7 +155,7 @@ def _track(methods: Sequence[Method], clip: LabeledClip) -> dict[str, ClipRun]:
     return runs
 
 
-def _decoded(video: Path, frames: range) -> Iterator[tuple[int, Image, float]]:
+def decoded_frames(video: Path, frames: range) -> Iterator[tuple[int, Image, float]]:
     """Yields the frames of a clip with their index and their time in seconds."""
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():

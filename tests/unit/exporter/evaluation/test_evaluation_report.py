@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from documentation import table_keys
 
 from lanestream.engine import load_engine
 from lanestream.errors import LabelError
@@ -119,13 +119,6 @@ def test_the_same_frames_give_the_same_figures(evaluation: Evaluation, figures: 
     assert "NaN" not in json.dumps(figures)
 
 
-def expanded(pattern: str) -> Iterator[str]:
-    """Yields `a.b` and `a.c` for `a.{b,c}`."""
-    parts = [part.split(",") for part in re.split(r"[{}]", pattern)]
-    fixed = [[",".join(part)] if index % 2 == 0 else part for index, part in enumerate(parts)]
-    return map("".join, itertools.product(*fixed))
-
-
 def documented() -> set[str]:
     """Returns the keys of the tables, each below every base that the paragraph before its table names."""
     text = DOCUMENT.read_text(encoding="utf-8")
@@ -133,8 +126,7 @@ def documented() -> set[str]:
     bases = [""]
     for part in text[text.index("## The keys of the JSON file") :].split("\n\n"):
         if part.startswith("|"):
-            cells = re.findall(r"^\| `([^`]+)` \|", part, flags=re.MULTILINE)
-            keys.update(key for base in bases for cell in cells for key in expanded(f"{base}.{cell}".lstrip(".")))
+            keys.update(key for base in bases for key in table_keys(part, base))
         else:
             bases = re.findall(r"`((?:images|clips)\.[^`]*)`", part) or [""]
     return keys
