@@ -72,7 +72,7 @@ _ROW_SIGMAS: Final = np.array([0.006, 0.003, 0.003])
 
 # Errors that last for seconds, which no filter can average out: of every place, in row offsets, of the vanishing column
 # and of the curvature term. Reported uncertainties include them.
-_PLACE_BIAS, _COLUMN_BIAS, _CURVATURE_BIAS = 0.06, 0.012, 0.004
+_PLACE_BIAS, _COLUMN_BIAS, _CURVATURE_BIAS = 0.06, 0.018, 0.004
 
 
 @dataclass(frozen=True)

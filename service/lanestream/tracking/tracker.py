@@ -127,8 +127,9 @@ class LaneTracker:
         events: list[Event] = []
         road = self._predicted_road(view, self._clock.now - earlier)
         values, noise = road.measure(detections)
-        pairs = self._associate(road, values, noise)
-        if is_cut or self._is_surprised(pairs, detections):
+        apart = self._apart(road, values)
+        pairs = self._associate(road, values, noise, apart)
+        if is_cut or (not pairs and self._is_elsewhere(apart)):
             events.append(SceneCut(timestamp))
             self._tracks, self._frames, self._activity, pairs = [], 0, 1.0, []
             self._lane_width, self._mean_horizon = USUAL_LANE_WIDTH, view.horizon
@@ -165,23 +166,25 @@ class LaneTracker:
         scales = np.array([track.scale for track in self._tracks])
         return road.predicted(seconds, self._activity, scales, coasting)
 
-    def _associate(self, road: RoadFilter, values: FloatArray, noise: FloatArray) -> list[tuple[int, int]]:
-        if not self._tracks or not len(values):
+    def _apart(self, road: RoadFilter, values: FloatArray) -> FloatArray:
+        """Returns how far each of M detections is to the right of each of N tracks, in lane widths (N, M)."""
+        # At the middle row, which both know well.
+        expected = road.curves().x(road.rows[1:2]) / road.depth
+        return np.asarray((values[:, 1] - expected) / (ROWS[1] * self._lane_width))
+
+    def _associate(
+        self, road: RoadFilter, values: FloatArray, noise: FloatArray, apart: FloatArray
+    ) -> list[tuple[int, int]]:
+        if not apart.size:
             return []
         expected, covariances = road.expected()
-        # Places are compared at the middle row, which both know well.
-        apart = (values[:, 1] - expected[:, 1, None]) / ROWS[1]
-        return associate(
-            expected[:, 1] / ROWS[1],
-            costs(expected, covariances, values, noise),
-            apart,
-            _FARTHEST * self._lane_width,
-        )
+        places = expected[:, 1] / (ROWS[1] * self._lane_width)
+        return associate(places, costs(expected, covariances, values, noise), apart, _FARTHEST)
 
-    def _is_surprised(self, pairs: Sequence[tuple[int, int]], detections: Sequence[Detection]) -> bool:
-        """Returns whether the frame shows another scene: nothing is where several boundaries were a frame ago."""
-        seen = sum(track.confirmed and track.hits[-1] for track in self._tracks)
-        return seen >= 2 and len(detections) >= 2 and not pairs
+    def _is_elsewhere(self, apart: FloatArray) -> bool:
+        """Returns whether nothing is near several boundaries that were found a frame ago."""
+        seen = apart[[track.confirmed and track.hits[-1] for track in self._tracks]]
+        return min(seen.shape) >= 2 and bool((np.abs(seen) > _FARTHEST).all())
 
     def _with_new_tracks(
         self, road: RoadFilter, pairs: list[tuple[int, int]], detections: Sequence[Detection], middle: float

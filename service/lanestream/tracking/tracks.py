@@ -27,7 +27,7 @@ _PROBABILITY_GAIN, _ROWS_GAIN = 0.4, 0.3
 # How quickly the scale of a track's noise and the activity of the road follow larger and smaller innovations than
 # expected, and the limits of both. A normalized innovation squared counts up to the last value.
 _SCALE_GAINS: Final = (0.06, 0.06)
-SCALES: Final = (0.0625, 5.0)
+SCALES: Final = (0.125, 5.0)
 ACTIVITY_GAINS: Final = (0.12, 0.12)
 ACTIVITIES: Final = (0.02, 4.0)
 MOST_SURPRISE: Final = 4.0

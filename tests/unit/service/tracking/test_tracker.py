@@ -378,7 +378,7 @@ def test_the_middle_of_the_vehicle_crosses_not_the_camera() -> None:
 
 def test_a_frame_in_which_nothing_is_where_it_was_shows_another_scene() -> None:
     def scene(i: int) -> list[Detection]:
-        return road(0.0) if i < 30 else [detection(b, -2000.0, v=450.0) for b in (-2.6, 0.0, 2.7)]
+        return road(0.0) if i < 30 else [detection(b) for b in (-LANE, 0.0, LANE)]
 
     results = drive(LaneTracker(), 40, scene)
     assert [i for i, result in enumerate(results) if result.events] == [30]
