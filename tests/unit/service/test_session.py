@@ -94,7 +94,7 @@ def test_another_size_resets_the_tracker() -> None:
     results = [session.process(fakes.picture(640, 360), 0.04 * i, infer) for i in range(5)]
     assert len(results[-1].lanes) == 2
     results += [session.process(fakes.picture(640, 480), 0.04 * i, infer) for i in (5, 6)]
-    assert [len(result.lanes) for result in results[-2:]] == [0, 0], "boundaries must be confirmed again"
+    assert [lane.age_s for lane in results[5].lanes] == [0.0, 0.0], "boundaries are new"
     assert detector.contexts[5].tracked is None
     assert detector.contexts[5].prior_horizon is None
     assert detector.contexts[6].horizon == pytest.approx(0.5 * 480), "the horizon of another size is forgotten"

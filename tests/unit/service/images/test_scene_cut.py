@@ -117,9 +117,9 @@ def test_a_memory_from_elsewhere_is_checked() -> None:
     memory, _ = SceneMemory().next(scene(9), DT)
     SceneMemory().validate()
     for wrong, reason in (
-        (replace(memory, thumbnail="!"), "not valid base 64"),
-        (replace(memory, thumbnail=memory.thumbnail[:-4]), "has 141 bytes; expected 144"),
-        (replace(memory, thumbnail=b64encode(bytes(145)).decode()), "has 145 bytes; expected 144"),
+        (SceneMemory(thumbnail="!"), "not valid base 64"),
+        (SceneMemory(thumbnail=memory.thumbnail[:-4]), "has 141 bytes; expected 144"),
+        (SceneMemory(thumbnail=b64encode(bytes(145)).decode()), "has 145 bytes; expected 144"),
     ):
         with pytest.raises(ValueError, match=reason) as error:
             wrong.validate()
