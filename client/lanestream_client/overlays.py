@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import needs_extra
-from lanestream_client.canvas import ALERT, DARK, WHITE, Canvas, Color, dashes, position_color, position_name
+from lanestream_client.drawing import ALERT, DARK, WHITE, Color, Drawing, dashes, position_color, position_name
 from lanestream_client.road_panel import draw_road_panel
 
 with needs_extra("video"):
@@ -30,32 +30,32 @@ _FORESHORTENING: Final = 1.6
 
 def draw_lanes(image: BgrImage, message: LanesMessage) -> BgrImage:
     """Returns a copy of `image`, BGR (H, W, 3) uint8, with the lanes of `message` drawn on it."""
-    canvas = Canvas.on_copy_of(image)
-    _draw_ego_lane(canvas, message)
+    drawing = Drawing.on_copy_of(image)
+    _draw_ego_lane(drawing, message)
     for lane in message.lanes:
-        _draw_ribbon(canvas, lane)
+        _draw_ribbon(drawing, lane)
     for lane in message.lanes:
-        _draw_label(canvas, lane)
-    _draw_legend(canvas, message)
-    draw_road_panel(canvas, message)
-    return canvas.image
+        _draw_label(drawing, lane)
+    _draw_legend(drawing, message)
+    draw_road_panel(drawing, message)
+    return drawing.image
 
 
 def draw_error(image: BgrImage, error: ErrorMessage) -> BgrImage:
     """Returns a copy of `image`, BGR (H, W, 3) uint8, with the error message written on it."""
-    canvas = Canvas.on_copy_of(image)
-    step = 26 * canvas.scale
+    drawing = Drawing.on_copy_of(image)
+    step = 26 * drawing.scale
     text = f"frame {error.seq}: {error.message}"
-    canvas.part(step / 2, step / 2, canvas.text_width(text) + step, 1.5 * step).darken()
-    canvas.text(text, (step, 1.45 * step), ALERT)
-    return canvas.image
+    drawing.part(step / 2, step / 2, drawing.text_width(text) + step, 1.5 * step).darken()
+    drawing.text(text, (step, 1.45 * step), ALERT)
+    return drawing.image
 
 
 def _columns(lane: LaneModel, rows: FloatArray) -> FloatArray:
     return np.array([lane.x(float(row)) for row in rows])
 
 
-def _draw_ego_lane(canvas: Canvas, message: LanesMessage) -> None:
+def _draw_ego_lane(drawing: Drawing, message: LanesMessage) -> None:
     """Fills the ego lane with a color that fades with distance."""
     by_id = {lane.track_id: lane for lane in message.lanes}
     left, right = by_id.get(message.ego.left or -1), by_id.get(message.ego.right or -1)
@@ -69,15 +69,15 @@ def _draw_ego_lane(canvas: Canvas, message: LanesMessage) -> None:
     outline = np.vstack(
         [np.column_stack([_columns(left, rows), rows]), np.column_stack([_columns(right, rows), rows])[::-1]]
     )
-    filled = Canvas(canvas.image.copy(), canvas.scale)
+    filled = Drawing(drawing.image.copy(), drawing.scale)
     filled.polygon(outline, _EGO_LANE)
     band = slice(max(0, int(top) - 1), int(bottom) + 2)
-    under, over = canvas.image[band], filled.image[band]
+    under, over = drawing.image[band], filled.image[band]
     alpha = np.interp(np.arange(band.start, band.start + len(under)), [top, bottom], [0.08, 0.38])[:, None, None]
     under[:] = (under + alpha * (over.astype(np.float32) - under)).astype(np.uint8)
 
 
-def _draw_ribbon(canvas: Canvas, lane: LaneModel) -> None:
+def _draw_ribbon(drawing: Drawing, lane: LaneModel) -> None:
     """Draws a boundary, with dashes unless it was detected. A dark rim keeps it visible on bright concrete."""
     bottom, top = lane.line.bottom[1], lane.line.top[1]
     pieces = dashes(lane.state)
@@ -85,38 +85,38 @@ def _draw_ribbon(canvas: Canvas, lane: LaneModel) -> None:
         # Dashes get shorter with distance, as those on a road do.
         start, end = (top + (bottom - top) * (1.0 - share) ** _FORESHORTENING for share in piece)
         rows = np.linspace(start, end, max(2, _SAMPLES // len(pieces)))
-        _fill_ribbon(canvas, lane, rows, DARK, rim=1.3 * canvas.scale)
-        _fill_ribbon(canvas, lane, rows, position_color(lane.position), rim=0.0)
+        _fill_ribbon(drawing, lane, rows, DARK, rim=1.3 * drawing.scale)
+        _fill_ribbon(drawing, lane, rows, position_color(lane.position), rim=0.0)
 
 
-def _fill_ribbon(canvas: Canvas, lane: LaneModel, rows: FloatArray, color: Color, rim: float) -> None:
-    road_height = max(1.0, canvas.image.shape[0] - 1.0 - lane.horizon)
+def _fill_ribbon(drawing: Drawing, lane: LaneModel, rows: FloatArray, color: Color, rim: float) -> None:
+    road_height = max(1.0, drawing.image.shape[0] - 1.0 - lane.horizon)
     nearness = np.clip((rows - lane.horizon) / road_height, 0.0, 1.0)
     columns = _columns(lane, rows)
     # The width is measured across the ribbon, not along the row, so that oblique boundaries do not shrink to hairlines.
     obliquity = np.minimum(3.0, np.hypot(1.0, np.gradient(columns, rows)))
-    half_width = ((1.2 + 4.3 * nearness) * canvas.scale + rim) * obliquity
+    half_width = ((1.2 + 4.3 * nearness) * drawing.scale + rim) * obliquity
     left, right = np.column_stack([columns - half_width, rows]), np.column_stack([columns + half_width, rows])
-    canvas.polygon(np.vstack([left, right[::-1]]), color)
+    drawing.polygon(np.vstack([left, right[::-1]]), color)
 
 
-def _draw_label(canvas: Canvas, lane: LaneModel) -> None:
+def _draw_label(drawing: Drawing, lane: LaneModel) -> None:
     """Writes the track id on a small label, a third of the way up the boundary."""
     row = lane.line.bottom[1] + 0.3 * (lane.line.top[1] - lane.line.bottom[1])
     column = float(_columns(lane, np.array([row]))[0])
     text = str(lane.track_id)
-    width, height = canvas.text_width(text) + 14 * canvas.scale, 24 * canvas.scale
-    left = min(max(0.0, column - width / 2), canvas.image.shape[1] - width)
+    width, height = drawing.text_width(text) + 14 * drawing.scale, 24 * drawing.scale
+    left = min(max(0.0, column - width / 2), drawing.image.shape[1] - width)
     corners = np.array([[left, row], [left + width, row], [left + width, row + height], [left, row + height]])
-    canvas.polygon(corners, DARK)
-    inset = 2 * canvas.scale
-    canvas.polygon(corners + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), position_color(lane.position))
-    canvas.text(text, (left + 7 * canvas.scale, row + 17.5 * canvas.scale), DARK)
+    drawing.polygon(corners, DARK)
+    inset = 2 * drawing.scale
+    drawing.polygon(corners + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), position_color(lane.position))
+    drawing.text(text, (left + 7 * drawing.scale, row + 17.5 * drawing.scale), DARK)
 
 
-def _draw_legend(canvas: Canvas, message: LanesMessage) -> None:
+def _draw_legend(drawing: Drawing, message: LanesMessage) -> None:
     """Writes the frame number and the latency, then the positions of the boundaries in their colors."""
-    step = 26 * canvas.scale
+    step = 26 * drawing.scale
     title = f"frame {message.seq}   {message.timing_ms.total:.1f} ms"
     entries = [
         (position_name(lane.position) + ("" if lane.state == "detected" else f", {lane.state}"), lane.position)
@@ -124,12 +124,12 @@ def _draw_legend(canvas: Canvas, message: LanesMessage) -> None:
     ]
     swatch = 1.1 * step
     width = (
-        max([canvas.text_width(title), *(swatch + canvas.text_width(text, 0.5) for text, _ in entries)]) + 1.2 * step
+        max([drawing.text_width(title), *(swatch + drawing.text_width(text, 0.5) for text, _ in entries)]) + 1.2 * step
     )
-    canvas.part(step / 2, step / 2, width, (1.5 + len(entries)) * step).darken()
-    canvas.text(title, (1.1 * step, 1.5 * step), WHITE)
+    drawing.part(step / 2, step / 2, width, (1.5 + len(entries)) * step).darken()
+    drawing.text(title, (1.1 * step, 1.5 * step), WHITE)
     for line, (text, position) in enumerate(entries, 1):
         middle = (1.3 + line) * step
         bar = np.array([[1.1, -0.12], [1.9, -0.12], [1.9, 0.12], [1.1, 0.12]]) * step + np.array([0.0, middle])
-        canvas.polygon(bar, position_color(position))
-        canvas.text(text, (1.1 * step + swatch, middle + 0.2 * step), WHITE, 0.5)
+        drawing.polygon(bar, position_color(position))
+        drawing.text(text, (1.1 * step + swatch, middle + 0.2 * step), WHITE, 0.5)

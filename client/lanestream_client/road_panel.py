@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import needs_extra
-from lanestream_client.canvas import ALERT, CAUTION, WHITE, Canvas, Color, dashes, position_color
+from lanestream_client.drawing import ALERT, CAUTION, WHITE, Color, Drawing, dashes, position_color
 
 with needs_extra("video"):
     import numpy as np
@@ -43,33 +43,33 @@ _STRAIGHT: Final = 1.0 / 3000.0
 _GRAY: Final[Color] = (150, 150, 150)
 
 
-def draw_road_panel(canvas: Canvas, message: LanesMessage) -> None:
+def draw_road_panel(drawing: Drawing, message: LanesMessage) -> None:
     """Draws the panel at the top right, and the map of the road beside it if the camera is known.
 
     Draws nothing on an image that is too narrow.
     """
-    if canvas.image.shape[1] < _LEAST_WIDTH * canvas.scale:
+    if drawing.image.shape[1] < _LEAST_WIDTH * drawing.scale:
         return
-    right = canvas.image.shape[1] - _STEP / 2.0 * canvas.scale
+    right = drawing.image.shape[1] - _STEP / 2.0 * drawing.scale
     grounds = [lane for lane in message.lanes if lane.ground is not None]
     if grounds:
-        width, height = _MAP_WIDTH * canvas.scale, _MAP_HEIGHT * canvas.scale
+        width, height = _MAP_WIDTH * drawing.scale, _MAP_HEIGHT * drawing.scale
         right -= width
-        part = canvas.part(right, _STEP / 2.0 * canvas.scale, width, height)
+        part = drawing.part(right, _STEP / 2.0 * drawing.scale, width, height)
         part.darken()
         _draw_map(part, grounds)
-        right -= 0.4 * _STEP * canvas.scale
+        right -= 0.4 * _STEP * drawing.scale
     if message.ego.offset is not None or message.departure is not None:
-        _draw_readings(canvas, right, message.ego, message.departure)
+        _draw_readings(drawing, right, message.ego, message.departure)
 
 
-def _draw_readings(canvas: Canvas, right: float, ego: EgoModel, departure: DepartureModel | None) -> None:
+def _draw_readings(drawing: Drawing, right: float, ego: EgoModel, departure: DepartureModel | None) -> None:
     """Draws the offset bar and lines of text that end at the column `right`."""
-    step, width = _STEP * canvas.scale, _WIDTH * canvas.scale
+    step, width = _STEP * drawing.scale, _WIDTH * drawing.scale
     texts = [(_offset_text(ego), WHITE), *((text, WHITE) for text in _road_texts(ego))]
     if departure is not None:
         texts.append(_departure_text(departure))
-    part = canvas.part(right - width, step / 2.0, width, (1.4 + len(texts)) * step)
+    part = drawing.part(right - width, step / 2.0, width, (1.4 + len(texts)) * step)
     part.darken()
     color = WHITE if departure is None else _departure_text(departure)[1]
     if ego.offset is not None:
@@ -78,23 +78,23 @@ def _draw_readings(canvas: Canvas, right: float, ego: EgoModel, departure: Depar
         part.text(text, (0.5 * step, (line - 0.1) * step), text_color, 0.5)
 
 
-def _draw_offset_bar(canvas: Canvas, offset: float, sigma: float, color: Color) -> None:
+def _draw_offset_bar(drawing: Drawing, offset: float, sigma: float, color: Color) -> None:
     """Draws the lane as a bar between its boundaries, and the vehicle's middle at `offset` lane widths in it."""
-    step, width = _STEP * canvas.scale, _WIDTH * canvas.scale
+    step, width = _STEP * drawing.scale, _WIDTH * drawing.scale
     middle, lane = 0.7 * step, 0.78 * width
 
     def column(share: float) -> float:
         return width / 2.0 + min(max(share, -_BAR_LANES), _BAR_LANES) * lane
 
-    canvas.rectangle(column(-0.5), middle - 0.06 * step, lane, 0.12 * step, _GRAY)
+    drawing.rectangle(column(-0.5), middle - 0.06 * step, lane, 0.12 * step, _GRAY)
     for edge, position in ((-0.5, -1), (0.5, 1)):
-        canvas.rectangle(
+        drawing.rectangle(
             column(edge) - 0.09 * step, middle - 0.35 * step, 0.18 * step, 0.7 * step, position_color(position)
         )
     start, end = column(offset - _SIGMAS * sigma), column(offset + _SIGMAS * sigma)
-    canvas.rectangle(start, middle - 0.12 * step, end - start, 0.24 * step, color)
+    drawing.rectangle(start, middle - 0.12 * step, end - start, 0.24 * step, color)
     at = column(offset)
-    canvas.polygon(
+    drawing.polygon(
         np.array(
             [
                 [at, middle - 0.42 * step],
@@ -142,31 +142,31 @@ def _departure_text(departure: DepartureModel) -> tuple[str, Color]:
     return f"DEPARTURE {departure.side}".upper() + ("" if time_s is None else f" {time_s:.1f} s"), CAUTION
 
 
-def _draw_map(canvas: Canvas, lanes: list[LaneModel]) -> None:
-    """Draws boundaries from above on the whole canvas, ahead is up, with their uncertainty as bands."""
-    height, width = canvas.image.shape[:2]
+def _draw_map(drawing: Drawing, lanes: list[LaneModel]) -> None:
+    """Draws boundaries from above, ahead is up, with their uncertainty as bands; fills the image."""
+    height, width = drawing.image.shape[:2]
     for distance in _GRID_M:
-        canvas.line(
+        drawing.line(
             _map_points(np.array([distance] * 2), np.array([-_SIDE_M, _SIDE_M]), width, height), (80, 76, 72), 1.0
         )
         if distance in _GRID_M[1::2]:
             (at,) = _map_points(np.array([distance]), np.array([_SIDE_M]), width, height)
-            canvas.text(f"{distance:.0f} m", (at[0] + 3.0 * canvas.scale, at[1] - 3.0 * canvas.scale), _GRAY, 0.36)
+            drawing.text(f"{distance:.0f} m", (at[0] + 3.0 * drawing.scale, at[1] - 3.0 * drawing.scale), _GRAY, 0.36)
     for lane in lanes:
-        _draw_band(canvas, lane)
+        _draw_band(drawing, lane)
     for lane in lanes:
         color = position_color(lane.position)
         for piece in dashes(lane.state):
             x = np.linspace(*(piece[0] * _AHEAD_M, piece[1] * _AHEAD_M), _SAMPLES)
-            canvas.line(_map_points(x, _lateral(lane, x), width, height), color, 2.0)
+            drawing.line(_map_points(x, _lateral(lane, x), width, height), color, 2.0)
     length, breadth = _VEHICLE_M
     corners = np.array([[-length, breadth], [0.0, breadth], [0.0, -breadth], [-length, -breadth]]) / np.array(
         [1.0, 2.0]
     )
-    canvas.polygon(_map_points(corners[:, 0], corners[:, 1], width, height), WHITE)
+    drawing.polygon(_map_points(corners[:, 0], corners[:, 1], width, height), WHITE)
 
 
-def _draw_band(canvas: Canvas, lane: LaneModel) -> None:
+def _draw_band(drawing: Drawing, lane: LaneModel) -> None:
     if lane.ground_covariance is None:
         return
     x = np.linspace(0.0, _AHEAD_M, _SAMPLES)
@@ -174,9 +174,9 @@ def _draw_band(canvas: Canvas, lane: LaneModel) -> None:
     variance = np.einsum("ni,ij,nj->n", powers, np.array(lane.ground_covariance), powers)
     half = np.minimum(_SIGMAS * np.sqrt(np.maximum(variance, 0.0)), 2.0 * _SIDE_M)
     y = _lateral(lane, x)
-    height, width = canvas.image.shape[:2]
+    height, width = drawing.image.shape[:2]
     outline = np.vstack([_map_points(x, y + half, width, height), _map_points(x, y - half, width, height)[::-1]])
-    canvas.polygon(outline, position_color(lane.position), opacity=0.35)
+    drawing.polygon(outline, position_color(lane.position), opacity=0.35)
 
 
 def _lateral(lane: LaneModel, x: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
@@ -186,7 +185,7 @@ async def detect(
     # Requests that fail anyway are refused before their body is read, and a slow body does not occupy a session.
     pool.capabilities.select(detector)
     start = StartMessage(horizon=horizon, detector=detector, camera=camera)
-    options = replace(service.session_options(start), single_image=True)
+    options = service.session_options(start)
     service.sessions.check_limits(caller)
     with service.answering(request, caller):
         async with service.bodies.image(request, caller.quota) as data:

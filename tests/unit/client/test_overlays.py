@@ -9,7 +9,7 @@ import pytest
 from lanestream.errors import SourceError
 from lanestream.protocol import DepartureModel, EgoModel, LaneModel, LanesMessage, LineModel, error_message
 from lanestream.road.view import Image
-from lanestream_client.canvas import ALERT, CAUTION
+from lanestream_client.drawing import ALERT, CAUTION
 from lanestream_client.overlays import draw_error, draw_lanes
 
 

@@ -58,22 +58,22 @@ def dashes(state: str) -> list[tuple[float, float]]:
 
 
 @dataclass(frozen=True)
-class Canvas:
+class Drawing:
     """An image to draw on. `scale` is the size of text and lines, 1 for an image 1280 pixels wide."""
 
     image: BgrImage
     scale: float
 
     @classmethod
-    def on_copy_of(cls, image: BgrImage) -> Canvas:
-        """Returns a canvas on a copy of `image`, BGR (H, W, 3) uint8."""
+    def on_copy_of(cls, image: BgrImage) -> Drawing:
+        """Returns a copy of `image`, BGR (H, W, 3) uint8, to draw on."""
         return cls(image.copy(), max(0.4, image.shape[1] / 1280.0))
 
-    def part(self, left: float, top: float, width: float, height: float) -> Canvas:
-        """Returns a canvas on a rectangle of this one, as far as it lies inside."""
+    def part(self, left: float, top: float, width: float, height: float) -> Drawing:
+        """Returns a rectangle of this image to draw on, as far as it lies inside; they share their pixels."""
         rows = slice(max(0, round(top)), max(0, round(top + height)))
         columns = slice(max(0, round(left)), max(0, round(left + width)))
-        return Canvas(self.image[rows, columns], self.scale)
+        return Drawing(self.image[rows, columns], self.scale)
 
     def polygon(self, points: FloatArray, color: Color, opacity: float = 1.0) -> None:
         """Fills the polygon with corners `points` (N, 2), anti-aliased, with subpixel precision."""
@@ -104,5 +104,5 @@ class Canvas:
         return float(cv2.getTextSize(text, _FONT, size * self.scale, max(1, round(self.scale)))[0][0])
 
     def darken(self) -> None:
-        """Darkens the canvas as a background for text."""
+        """Darkens the image as a background for text."""
         self.image[:] = (0.35 * self.image + 0.65 * np.array(DARK)).astype(np.uint8)
