@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import click
@@ -68,17 +71,27 @@ def calibrate(
     From pictures of a chessboard comes the lens: focal lengths, principal point and distortion. From a drive along
     mostly straight roads, for a lens given by --camera or --field-of-view, come the camera's pitch and yaw.
     """
+    with _writing(out):
+        # A drive takes minutes to look through.
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=out.parent):
+            pass
     if camera_file is None and field_of_view is None:
         camera = _lens(source, board, height)
     else:
         camera = _mount(source, _start(camera_file, height, field_of_view))
     text = json.dumps(camera.model_dump(mode="json", exclude_defaults=True), indent=2) + "\n"
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+    with _writing(out):
         out.write_text(text, encoding="utf-8")
+    click.echo(f"camera file: {out}")
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise SourceError(f"can't write {out}: {(error.strerror or str(error)).lower()}") from None
-    click.echo(f"camera file: {out}")
 
 
 def _lens(source: Path, board: tuple[int, int], height: float | None) -> CameraModel:

@@ -63,6 +63,7 @@ def folder(tmp_path: Path) -> Path:
         ("data check missing", "there is nothing at missing"),
         ("data check none", "no labels of a known format in none"),
         ("data check none --sheet sheet.txt", "can't write an image to sheet.txt"),
+        ("calibrate none -o /proc/camera/x.json --height 1.4", "can't write /proc/camera/x.json: no such file"),
         ("data check none --format cvat", "no labeled frames of format cvat in none"),
         ("score missing.jsonl half.jsonl", "can't read missing.jsonl"),
         ("score text half.jsonl", "text:1 is not a valid `lanes` message"),

@@ -61,6 +61,13 @@ def test_a_clip_ends_with_the_stream(tmp_path: Path) -> None:
     assert numbers(path) == list(range(88, 100))
 
 
+def test_a_folder_that_cannot_be_written_is_reported_before_any_departure(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(SourceError, match=r"can't write to the folder .*file/clips: not a directory"):
+        record(blocked / "clips", [])
+
+
 def test_failed_frames_are_recorded_with_their_error(tmp_path: Path) -> None:
     with departure_clips(tmp_path, 1.0, FPS) as clips:
         assert clips is not None
