@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import fakes
 import pytest
+import redis
 from processes import service
 from redisserver import redis_server
 from tcpproxy import tcp_proxy
 
 from lanestream.protocol import EgoModel
+from lanestream.streaming.record import SessionRecord
 from lanestream_client import LaneClient, SourceFrame, StreamResult
 
 STREAMS = 4
 IN_FLIGHT = 2
+# The answers of a stream before its replica ends: its boundaries have ids by then.
+ANSWERS = 6
 SLOW_WAIT_S = 6 * fakes.WAIT_S  # loading and running real networks is slow when other tests run in parallel
 
 
@@ -54,6 +59,19 @@ def test_track_ids_survive_broken_connections(url: str, mode: str) -> None:
     assert {result.error.code for result in results if result.error} <= {"lost"}
 
 
+def wait_until_saved(redis_url: str) -> None:
+    """Waits until Redis has each stream after its first answers: a replica saves it in the background."""
+    end = time.monotonic() + SLOW_WAIT_S
+    with redis.Redis.from_url(redis_url) as client:
+        while time.monotonic() < end:
+            data = [client.hget(key, "data") for key in client.scan_iter("lanestream:session:*")]
+            records = [SessionRecord.from_bytes(value) for value in data if isinstance(value, bytes)]
+            if sum(record is not None and (record.last_seq or 0) >= ANSWERS - 1 for record in records) == STREAMS:
+                return
+            time.sleep(0.05)
+    pytest.fail("the streams were not saved")
+
+
 @dataclass
 class CameraClient:
     """Streams one image in mode `all`, over any of the replicas, until `stop` is set.
@@ -75,7 +93,7 @@ class CameraClient:
             stream = client.stream(self._source(), mode="all")
             for result in stream:
                 self.results.append(result)
-                if len(self.results) == 6:
+                if len(self.results) == ANSWERS:
                     self.barrier.wait(SLOW_WAIT_S)
                 if result.lanes is not None and stream.reconnects == len(self.egos) - 1:
                     self.egos[-1] = result.lanes.ego
@@ -109,6 +127,7 @@ def test_every_stream_continues_on_the_other_replica(tmp_path: Path, road: bytes
         for thread in threads:
             thread.start()
         barrier.wait(SLOW_WAIT_S)
+        wait_until_saved(redis_url)
         process.send_signal(end)
         barrier.wait(SLOW_WAIT_S)
         stop.set()
