@@ -44,18 +44,24 @@ lint: $(DEV_READY)
 
 MODELS := service/lanestream/models
 
+DATA ?= ../shared/data
+
 # Trains networks like the shipped ones and writes them to out/. Takes hours on a CPU; continues after an interruption.
+models: export LANESTREAM_DATA = $(DATA)
 models: $(DEV_READY)
 	mkdir -p out
 	$(BIN)/lanestream train regressor --run runs/regressor
-	$(BIN)/lanestream train regressor regressor-second --run runs/regressor-second
-	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx
+	$(BIN)/lanestream export runs/regressor/best.pt out/regressor-first.onnx
 	$(BIN)/lanestream train classifier --run runs/classifier
+	$(BIN)/lanestream export runs/classifier/best.pt out/classifier-first.onnx --regressor out/regressor-first.onnx
+	$(BIN)/lanestream train regressor regressor-second --run runs/regressor-second --frames runs/regressor/frames
+	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx
 	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
-	$(BIN)/lanestream train classifier classifier-third --run runs/classifier-third
-	$(BIN)/lanestream export runs/classifier-third/best.pt out/classifier.onnx --regressor out/regressor.onnx
-	$(BIN)/lanestream export runs/classifier-third/best.pt out/classifier-fp32.onnx --precision fp32 \
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx --regressor out/regressor.onnx
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx --precision fp32 \
 	  --regressor out/regressor.onnx
+	$(BIN)/lanestream train checkpoint runs/regressor-second/best.pt out/regressor.pt
+	$(BIN)/lanestream train checkpoint runs/classifier-second/best.pt out/classifier.pt
 
 evaluate: $(DEV_READY)
 	$(BIN)/lanestream evaluate --split test --model $(MODELS)/classifier.onnx --model $(MODELS)/regressor.onnx \

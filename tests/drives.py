@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from lanestream.road.appearance import Appearance
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection, FrameResult
 from lanestream.road.view import RoadView, visible_rows
@@ -27,12 +28,13 @@ def detection(
     probability: float = 0.95,
     paint: float = 1.0,
     expected: bool = False,
+    appearance: Appearance | None = None,
 ) -> Detection:
     """Returns a boundary at the lateral position `b`, in row offsets, with the vanishing column `v`."""
     curve = Curve(view.horizon, (v, b, k))
     rows = visible_rows(curve, view)
     assert rows is not None
-    return Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, probability, paint, expected)
+    return Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, probability, paint, expected, appearance or Appearance())
 
 
 def road(

@@ -14,6 +14,7 @@ from lanestream.detection.interface import Detections, FrameContext, Infer, Mode
 from lanestream.engine import Engine
 from lanestream.inference.loaded_model import Placement
 from lanestream.protocol import EgoModel, LanesMessage, Limits, Mode, ReadyMessage, TimingModel
+from lanestream.road.appearance import Appearance
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_rows
@@ -28,6 +29,7 @@ class FakeDetector:
 
     role: ModelRole = "classifier"
     slopes: tuple[float, ...] = (-1.15, 1.15)
+    appearances: tuple[Appearance, ...] = (Appearance(), Appearance())
 
     def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
         height, width = image.shape[:2]
@@ -36,11 +38,12 @@ class FakeDetector:
         if image.min() == 255:
             raise RuntimeError("the detector failed")
         found = []
-        for slope in self.slopes:
+        for slope, appearance in zip(self.slopes, self.appearances, strict=False):
             curve = Curve(view.horizon, (view.middle, slope, 0.0))
             rows = visible_rows(curve, view)
             if rows is not None:
-                found.append(Detection(curve, np.diag([1.0, 1e-4, 50.0]), *rows, 0.9, expected=True))
+                covariance = np.diag([1.0, 1e-4, 50.0])
+                found.append(Detection(curve, covariance, *rows, 0.9, expected=True, appearance=appearance))
         return Detections(tuple(found), view, horizon_weight=1.0)
 
 
@@ -49,6 +52,12 @@ class LeftDetector(FakeDetector):
 
     role = "regressor"
     slopes = (-1.15,)
+
+
+class KindsDetector(FakeDetector):
+    """Sees a dashed yellow marking on the left and the edge of the road on the right."""
+
+    appearances = (Appearance(0.02, (0.03, 0.95, 0.01, 0.01), (0.04, 0.96)), Appearance(0.97, (0.25,) * 4, (0.5, 0.5)))
 
 
 class DriftingDetector(FakeDetector):
@@ -118,6 +127,11 @@ def left_engine() -> Engine:
 def drifting_engine() -> Engine:
     """Returns an engine for one camera, which leaves its lane."""
     return engine(detector=DriftingDetector())
+
+
+def kinds_engine() -> Engine:
+    """Returns an engine that sees a dashed yellow marking on the left and the edge of the road on the right."""
+    return engine(detector=KindsDetector())
 
 
 def two_detectors() -> Engine:

@@ -1,4 +1,4 @@
-"""Drawn roads: paint along known curves, anti-aliased, so that positions are exact to a fraction of a pixel."""
+"""Drawn roads: paint and surfaces along known curves, anti-aliased, so that positions are exact to part of a pixel."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.detection.features import Channels
 from lanestream.road.curve import Curve, Curves
 from lanestream.road.view import Image, RoadView
 
@@ -47,6 +48,29 @@ def draw_road(
         part = levels[int(rows[0]) :]
         part += cover * (paint - part)
     return np.asarray(levels.round(), np.uint8)
+
+
+def draw_surfaces(
+    view: RoadView, edges: Sequence[Curve], colors: Sequence[tuple[int, int, int]], noise: float = 2.0
+) -> Image:
+    """Returns a BGR image (H, W, 3) of surfaces of these `colors`, from left to right, with `edges` between them."""
+    rows, columns = np.arange(view.height, dtype=float), np.arange(view.width, dtype=float)
+    levels = np.random.default_rng(5).normal(0.0, noise, (view.height, view.width, 1)) + np.array(colors[0], float)
+    for edge, left, right in zip(edges, colors[:-1], colors[1:], strict=True):
+        cover = np.clip(columns - edge.x(rows)[:, None] + 0.5, 0.0, 1.0)
+        levels += cover[:, :, None] * (np.array(right, float) - np.array(left, float))
+    return np.asarray(levels.clip(0, 255), np.uint8)
+
+
+def paint_on(image: Image, view: RoadView, curves: Sequence[Curve], *, width: float = 0.1, paint: int = PAINT) -> Image:
+    """Returns a BGR image (H, W, 3) with white paint along `curves`, `width` row offsets wide."""
+    painted = [draw_road(view, curves, width=width, paint=paint, gray=image[:, :, channel]) for channel in range(3)]
+    return np.stack(painted, axis=2)
+
+
+def channels(gray: Image) -> Channels:
+    """Returns the channels of gray levels (H, W)."""
+    return Channels(gray, gray)
 
 
 def in_color(gray: Image) -> Image:

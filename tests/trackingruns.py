@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lanestream_exporter.evaluation.tracking.answers import Answer
-from lanestream_exporter.evaluation.tracking.comparison import ClipRun
+from lanestream_exporter.evaluation.tracking.comparison import ClipRun, without_edges
 from lanestream_exporter.evaluation.tracking.truth import TruthFrame
 
 WIDTH, HEIGHT, HORIZON, FPS = 640, 360, 160.0, 25.0
@@ -21,20 +21,22 @@ DEPTH = HEIGHT - 1.0 - HORIZON
 
 @dataclass(frozen=True)
 class TrueLane:
-    """A true straight boundary at `place` lane widths right of the camera."""
+    """A true straight boundary at `place` lane widths right of the camera; of the type `kerb` or `edge` no marking."""
 
     lane_id: int
     place: float
     gap: int = 0
     gap_length: int = 0
     position: int | None = None
+    type: str = "solid"
 
 
 @dataclass(frozen=True)
 class Reported:
     """A reported straight boundary at `place` lane widths right of the camera.
 
-    `sigma` is in lane widths, and the error of the lateral position; the vanishing column is exact.
+    `sigma` is in lane widths, and the error of the lateral position; the vanishing column is exact. Without a `type` it
+    is reported as by a model that does not classify markings.
     """
 
     track_id: int
@@ -42,6 +44,9 @@ class Reported:
     position: int = 0
     state: str = "detected"
     sigma: float = 0.02
+    kind: str = "marking"
+    type: str | None = None
+    color: str = "white"
 
 
 PAIR = (TrueLane(1, -0.5), TrueLane(2, 0.5))
@@ -70,7 +75,7 @@ def record(frame: int, lanes: Iterable[TrueLane] = PAIR, **fields: Any) -> dict[
             {
                 "id": lane.lane_id,
                 "position": side(lane.place) if lane.position is None else lane.position,
-                "type": "solid",
+                "type": lane.type,
                 "color": "white",
                 "points": _points(lane.place),
                 "paint": 0.0 if lane.gap else 1.0,
@@ -97,6 +102,8 @@ def message(frame: int, lanes: Iterable[Reported], **fields: Any) -> dict[str, A
                 "track_id": lane.track_id,
                 "position": lane.position or side(lane.place),
                 "state": lane.state,
+                "kind": lane.kind,
+                "marking": None if lane.type is None else {"type": lane.type, "color": lane.color},
                 "horizon": HORIZON,
                 "coefficients": [320.0, lane.place * LANE, 0.0],
                 "covariance": np.diag([0.0, (lane.sigma * LANE) ** 2, 0.0]).tolist(),
@@ -118,10 +125,9 @@ def run(
     """Returns a run of `frames` frames; the functions give the boundaries and more fields of each by its number."""
     result = ClipRun(kind, "0")
     for number in range(frames):
-        result.add(
-            TruthFrame.from_record(record(number, truth(number), **record_fields(number))),
-            Answer.from_message(message(number, answer(number), **message_fields(number))),
-        )
+        true = TruthFrame.from_record(record(number, truth(number), **record_fields(number)))
+        found = Answer.from_message(message(number, answer(number), **message_fields(number)))
+        result.add(true, without_edges(true, found))
     return result
 
 

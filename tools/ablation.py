@@ -82,10 +82,10 @@ def _propose(**changes: Any) -> Leave:
     """Returns what calls `propose` without the given arguments."""
     real = proposals.propose
 
-    def propose(gray: Any, context: Any, prior: Any, on_paint: Any, limit: int = proposals.MOST_CANDIDATES) -> Any:
+    def propose(channels: Any, context: Any, prior: Any, fitted: Any, limit: int = proposals.MOST_CANDIDATES) -> Any:
         if "tracked" in changes:
             context = replace(context, tracked=None)
-        return real(gray, context, prior, None if "on_paint" in changes else on_paint, limit)
+        return real(channels, context, prior, None if "fitted" in changes else fitted, limit)
 
     return _replace(candidate_detector, "propose", propose)
 
@@ -100,8 +100,8 @@ def _without_own_boundaries(engine: Engine, stack: ExitStack) -> Engine:
     real = Curves.concatenate
 
     def concatenate(parts: Any) -> Curves:
-        if len(parts) == 4:  # tracked, prior's, next lanes, found
-            parts = [parts[0], Curves.none(parts[0].horizon), *parts[2:]]
+        if len(parts) == 4:  # prior's, next lanes, tracked, found
+            parts = [Curves.none(parts[0].horizon), *parts[1:]]
         return real(parts)
 
     stack.enter_context(patch.object(Curves, "concatenate", concatenate))
@@ -116,24 +116,27 @@ STAGES: Final[dict[str, Leave | None]] = {
     "lines through the vanishing point": _replace(proposals, "find_lines", _without_lines),
     "tracked boundaries as candidates": _propose(tracked=None),
     "prior's boundaries as candidates": _without_own_boundaries,
-    "prior's boundaries on the paint as candidates": _propose(on_paint=None),
+    "prior's boundaries on the paint as candidates": _propose(fitted=None),
+    "steps between surfaces as candidates": _replace(proposals, "_LEAST_STEPS", np.inf),
     "next lanes as candidates": _replace(LaneSpacing, "neighbors", np.empty(0)),
     "lane-spacing weight of lines": _replace(proposals, "_UNSPACED_SHARE", 1.0),
     "least strength of lines": _replace(proposals, "_LEAST_STRENGTH", 0.0),
-    "prior's odds": _replace(EgoPrior, "odds", lambda self, curves: np.ones(len(curves))),
+    "prior's odds": _replace(EgoPrior, "odds", lambda self, curves: np.ones((len(curves), 2))),
     "mean of candidates that agree": _replace(
         candidate_detector, "_means", lambda curves, probability, gaps, chosen, view: curves.take(chosen)
     ),
     "curve fit": _replace(
         candidate_detector,
         "fit_curves",
-        lambda gray, curves, spans, view: curve_fit.Fits(
-            curves, np.tile(np.diag([4.0, 4e-4, 4e4]), (len(curves), 1, 1)), view
+        lambda channels, curves, spans, view, is_edge: curve_fit.Fits(
+            curves, np.tile(np.diag([4.0, 4e-4, 4e4]), (len(curves), 1, 1)), np.ones(len(curves)), view
         ),
     ),
     "common road in the fit": _replace(curve_fit, "_COMMON_SIGMA", np.array([9.0, 9.0])),
     "common horizon in the fit": _replace(curve_fit, "_ROAD_SIGMA", np.array([0.1, 1e-6, 0.03])),
-    "middle of double lines": _replace(curve_fit, "_between_stripes", lambda gray, fits, top, bottom: fits.curves),
+    "middle of double lines": _replace(
+        curve_fit, "_stripe_shifts", lambda gray, fits, top, bottom: np.zeros(len(fits.curves))
+    ),
     "separation of boundaries": _replace(candidate_detector, "_CLOSEST", -1.0),
 }
 

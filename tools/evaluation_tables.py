@@ -19,9 +19,16 @@ def main(path: Path) -> None:
     try:
         evaluation = json.loads(path.read_text(encoding="utf-8"))
         images, clips = evaluation["images"], evaluation["clips"]
+        datasets, conditions = evaluation["datasets"], evaluation["conditions"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise click.ClickException(f"{path} was not written by `lanestream evaluate --json`: {error}") from error
+    click.echo("\n".join(f"- {line}" for line in evaluation["verdicts"]))
     for title, head, rows in (
+        ("Boundaries by data set", _BOUNDARIES, _rows(datasets, lambda groups: _boundaries(groups["boundaries"]))),
+        ("Kinds by data set", _KINDS, _rows(datasets, lambda groups: _kinds(groups["kinds"]))),
+        ("Boundaries by condition", _BOUNDARIES, _rows(conditions, lambda groups: _boundaries(groups["boundaries"]))),
+        ("Kinds by condition", _KINDS, _rows(conditions, lambda groups: _kinds(groups["kinds"]))),
+        ("Kinds, clips with the tracker", _KINDS, _rows(clips, lambda groups: _kinds(groups["kinds"]["tracked"]))),
         ("A. Candidates by the classifier", _CANDIDATES, _rows(images, _candidates)),
         ("A. Candidates by the detector", _CANDIDATES, _rows(images, _detected)),
         ("Proposal recall", _PROPOSAL_RECALL, _rows(images, _proposal_recall)),
@@ -48,7 +55,8 @@ def main(path: Path) -> None:
 
 _CANDIDATES = ("precision", "recall", "accuracy", "average precision", "base rate", "unsure, unknown")
 _PROPOSAL_RECALL = ("ego, 8", "ego, 16", "ego, 32", "all, 8", "all, 16", "all, 32")
-_BOUNDARIES = ("ego precision", "ego recall", "ego error, px", "all precision", "all recall")
+_BOUNDARIES = ("ego base rate", "ego precision", "ego recall", "ego error, px", "all precision", "all recall")
+_KINDS = ("frames with a false marking", "edge precision", "edge recall", "type right", "color right")
 _STEADINESS = ("both ego boundaries", "jitter, px", "identity switches")
 _LATERAL = ("10 m, px", "ratio to constant", "30 m, px", "ratio to constant", "reached 30 m", "ratio, straight")
 _METRICS = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
@@ -56,7 +64,7 @@ _METRICS = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
 
 def _rows(methods: Mapping[str, Any], cells: Any) -> Iterable[list[str]]:
     """Yields a row for each drive and method that has such numbers."""
-    for drive in next(iter(methods.values())):
+    for drive in next(iter(methods.values()), {}):
         for method, drives in methods.items():
             row = cells(drives[drive])
             if row:
@@ -101,10 +109,25 @@ def _boundaries(part: Groups) -> list[str]:
     for which in ("ego", "all"):
         group = part[which]
         right, wrong, missed = (group[key] for key in ("right", "wrong", "missed"))
+        cells += [_share(group["base_rate"])] if which == "ego" else []
         cells += [_counted(group, "precision", right, right + wrong), _counted(group, "recall", right, right + missed)]
         if which == "ego":
             cells.append(_pixels(group["mean_error_px_640"]))
     return cells
+
+
+def _kinds(part: Groups) -> list[str]:
+    false, edges = part["false_markings"]["unmarked"], part["road_edges"]
+    right, wrong, labeled = (edges[key] for key in ("right", "wrong", "labeled"))
+    looks = (part["types"], part["colors"])
+    if not any((false["frames"], edges["frames"], *(look["markings"] for look in looks))):
+        return []
+    return [
+        _counted(false, "share", false["with_marking"], false["frames"]),
+        _counted(edges, "precision", right, right + wrong),
+        _counted(edges, "recall", right, labeled),
+        *(f"{_share(look['right_share'])} ({look['right']} / {look['markings']})" for look in looks),
+    ]
 
 
 def _steady(groups: Groups) -> list[str]:

@@ -17,6 +17,7 @@ from websockets.exceptions import ConnectionClosed
 
 from lanestream.errors import LanestreamError
 from lanestream.protocol import (
+    BoundaryKind,
     CameraModel,
     DepartureOptions,
     DetectorName,
@@ -31,6 +32,7 @@ from lanestream_client.endpoint import (
     READY_TIMEOUT_S,
     connect_options,
     http_errors,
+    http_options,
     parse_endpoints,
     websocket_errors,
 )
@@ -55,7 +57,8 @@ class AsyncLaneClient:
         self._timeout = timeout
         self._in_flight = in_flight
         self._retry = RetryPolicy(reconnect_s)
-        self._http = httpx.AsyncClient(timeout=timeout, headers=self._endpoints[0].headers)
+        options = http_options(self._endpoints, httpx.AsyncHTTPTransport)
+        self._http = httpx.AsyncClient(timeout=timeout, headers=self._endpoints[0].headers, **options)
 
     async def __aenter__(self) -> Self:
         return self
@@ -84,14 +87,16 @@ class AsyncLaneClient:
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
     ) -> LanesMessage:
         """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, or its path.
 
-        `horizon` is the row of the horizon as a share of the image height, estimated if None. `detector` defaults to
-        the service's. With a `camera` the lanes are also given in meters. Raises SourceError if the file can't be read.
+        `horizon` is the row of the horizon as a share of the image height, from -0.6 (above the image) to 1, estimated
+        if None. `detector` defaults to the service's. With a `camera` the lanes are also given in meters. `kinds` are
+        those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read.
         """
         data = await asyncio.to_thread(requests.read_image_file, image)
-        query = requests.detect_query(horizon, detector, camera)
+        query = requests.detect_query(horizon, detector, camera, kinds)
         response = await self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
         return requests.parse_lanes(response)
 
@@ -104,6 +109,7 @@ class AsyncLaneClient:
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         departure: DepartureOptions | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
         session: str | None = None,
     ) -> AsyncLaneStream:
         """Returns the results of one camera's frames, in frame order, as they arrive; see LaneClient.stream.
@@ -111,7 +117,7 @@ class AsyncLaneClient:
         A source that is not an async iterable is read in a thread, because it may block.
         """
         source = frames if isinstance(frames, AsyncIterable) else _read_in_thread(frames)
-        start = requests.start_message(mode, horizon, detector, camera, departure, session)
+        start = requests.start_message(mode, horizon, detector, camera, departure, kinds, session)
         failover = FailoverPolicy(self._endpoints, self._retry, self._timeout)
         return AsyncLaneStream(failover, source, ClientProtocol(start, in_flight=self._in_flight))
 
@@ -126,7 +132,7 @@ class AsyncLaneClient:
     async def _request_from_first(self, send: Callable[[str], Awaitable[httpx.Response]]) -> httpx.Response:
         endpoint = self._endpoints[0]
         with http_errors(endpoint):
-            return requests.check_response(await send(endpoint.http))
+            return requests.check_response(await send(endpoint.http), endpoint)
 
 
 class AsyncLaneStream:

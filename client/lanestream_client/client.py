@@ -18,6 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from lanestream.errors import LanestreamError
 from lanestream.protocol import (
+    BoundaryKind,
     CameraModel,
     DepartureOptions,
     DetectorName,
@@ -32,6 +33,7 @@ from lanestream_client.endpoint import (
     READY_TIMEOUT_S,
     connect_options,
     http_errors,
+    http_options,
     parse_endpoints,
     websocket_errors,
 )
@@ -64,7 +66,8 @@ class LaneClient:
         self._timeout = timeout
         self._in_flight = in_flight
         self._retry = RetryPolicy(reconnect_s)
-        self._http = httpx.Client(timeout=timeout, headers=self._endpoints[0].headers)
+        options = http_options(self._endpoints, httpx.HTTPTransport)
+        self._http = httpx.Client(timeout=timeout, headers=self._endpoints[0].headers, **options)
 
     def __enter__(self) -> Self:
         return self
@@ -91,14 +94,16 @@ class LaneClient:
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
     ) -> LanesMessage:
         """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, or its path.
 
-        `horizon` is the row of the horizon as a share of the image height, estimated if None. `detector` defaults to
-        the service's. With a `camera` the lanes are also given in meters. Raises SourceError if the file can't be read.
+        `horizon` is the row of the horizon as a share of the image height, from -0.6 (above the image) to 1, estimated
+        if None. `detector` defaults to the service's. With a `camera` the lanes are also given in meters. `kinds` are
+        those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read.
         """
         data = requests.read_image_file(image)
-        query = requests.detect_query(horizon, detector, camera)
+        query = requests.detect_query(horizon, detector, camera, kinds)
         response = self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
         return requests.parse_lanes(response)
 
@@ -111,16 +116,17 @@ class LaneClient:
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         departure: DepartureOptions | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
         session: str | None = None,
     ) -> LaneStream:
         """Returns the results of one camera's frames, in frame order, as they arrive.
 
-        `horizon`, `detector` and `camera` are as for `detect`; `departure` says when to warn of lane departures, which
-        needs a camera; `session` is a name for the service's logs. A frame that the service refuses, or whose result is
-        lost with a connection, yields a result with an `error`, and the stream continues. Raises ProtocolError if an
-        argument is not valid.
+        `horizon`, `detector`, `camera` and `kinds` are as for `detect`; `departure` says when to warn of lane
+        departures, which needs a camera; `session` is a name for the service's logs. A frame that the service refuses,
+        or whose result is lost with a connection, yields a result with an `error`, and the stream continues. Raises
+        ProtocolError if an argument is not valid.
         """
-        start = requests.start_message(mode, horizon, detector, camera, departure, session)
+        start = requests.start_message(mode, horizon, detector, camera, departure, kinds, session)
         failover = FailoverPolicy(self._endpoints, self._retry, self._timeout)
         return LaneStream(failover, as_source_frames(frames), ClientProtocol(start, in_flight=self._in_flight))
 
@@ -135,7 +141,7 @@ class LaneClient:
     def _request_from_first(self, send: Callable[[str], httpx.Response]) -> httpx.Response:
         endpoint = self._endpoints[0]
         with http_errors(endpoint):
-            return requests.check_response(send(endpoint.http))
+            return requests.check_response(send(endpoint.http), endpoint)
 
 
 class LaneStream:

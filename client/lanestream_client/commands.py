@@ -18,21 +18,29 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lanestream.errors import ImageError, LanestreamError, SourceError, needs_extra
-from lanestream.protocol import CameraModel, DetectorName, Mode, parse_camera, read_camera_file
+from lanestream.protocol import (
+    HIGHEST_HORIZON,
+    BoundaryKind,
+    CameraModel,
+    DetectorName,
+    Mode,
+    parse_camera,
+    read_camera_file,
+)
 from lanestream_client.client import LaneClient
 from lanestream_client.departure_clips import departure_clips
 from lanestream_client.failover import RetryPolicy
-from lanestream_client.frames import SourceFrame, StreamResult
+from lanestream_client.frames import CameraSource, SourceCounts, SourceFrame, StreamResult
 from lanestream_client.in_process import InProcessClient, InProcessEngine
 from lanestream_client.requests import ServiceInfo
 from lanestream_client.sinks import RunReport, json_lines_sink, video_sink
-from lanestream_client.sources import NewestFrames, image_files, open_source
+from lanestream_client.sources import RECONNECT_CAMERA_S, NewestFrames, image_files, open_source
+from lanestream_client.video_sources import RtspTransport
 
 if TYPE_CHECKING:
     from lanestream.protocol import LanesMessage
     from lanestream_client.in_process import LaneService, ResultStream
     from lanestream_client.sinks import ResultSink
-    from lanestream_client.sources import CameraSource
 
 # Loads an engine from the model file, the name of the execution provider and the regressor file. Each may be None for
 # the default. Raises click.BadParameter if the provider is unknown.
@@ -74,8 +82,8 @@ def _common_options(command: _Command) -> _Command:
         ),
         click.option(
             "--horizon",
-            type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-            help="Row of the horizon as a share of the image height  [default: estimated]",
+            type=click.FloatRange(HIGHEST_HORIZON, 1.0, max_open=True),
+            help="Row of the horizon as a share of the image height, negative above the image  [default: estimated]",
         ),
         click.option(
             "--camera",
@@ -95,6 +103,12 @@ def _common_options(command: _Command) -> _Command:
             type=click.FloatRange(20.0, 150.0),
             metavar="DEG",
             help="Horizontal field of view of the camera in degrees.",
+        ),
+        click.option(
+            "--kinds",
+            type=click.Choice(get_args(BoundaryKind)),
+            multiple=True,
+            help="Kind of boundaries to report; repeat it for several  [default: the service's, or all]",
         ),
         click.option(
             "--jsonl",
@@ -123,6 +137,7 @@ def detect(
     camera_file: Path | None,
     camera_height: float | None,
     field_of_view: float | None,
+    kinds: tuple[BoundaryKind, ...],
     jsonl: Path | None,
     annotate: Path | None,
     **where: Any,
@@ -133,7 +148,7 @@ def detect(
     report = RunReport()
     with ExitStack() as stack:
         service = stack.enter_context(_open_service(context.obj, **where))
-        detect_one = partial(service.detect, horizon=horizon, detector=detector, camera=camera)
+        detect_one = partial(service.detect, horizon=horizon, detector=detector, camera=camera, kinds=kinds or None)
         json_lines = stack.enter_context(json_lines_sink(jsonl))
         advance = stack.enter_context(_progress_bar("images", len(files)))
         for path in files:
@@ -175,6 +190,21 @@ def detect(
     metavar="SECONDS",
     help="Give up after this time without a connection; 0 disables reconnecting  [default: 30]",
 )
+@click.option(
+    "--reconnect-camera",
+    type=click.FloatRange(min=0.0),
+    default=RECONNECT_CAMERA_S,
+    show_default=True,
+    metavar="SECONDS",
+    help="Give up a live camera that is lost after this time; 0 disables opening it again.",
+)
+@click.option(
+    "--rtsp-transport",
+    type=click.Choice(get_args(RtspTransport)),
+    default="auto",
+    show_default=True,
+    help="Transport of RTSP cameras; auto is TCP, and UDP if that fails.",
+)
 @click.option("--session", metavar="NAME", help="Name of the stream in the service's logs.")
 @click.option(
     "--record-departures",
@@ -199,10 +229,13 @@ def stream(
     camera_file: Path | None,
     camera_height: float | None,
     field_of_view: float | None,
+    kinds: tuple[BoundaryKind, ...],
     jsonl: Path | None,
     mode: Mode | None,
     video: Path | None,
     fps: float,
+    reconnect_camera: float,
+    rtsp_transport: RtspTransport,
     session: str | None,
     record_departures: float | None,
     departures_folder: Path,
@@ -220,7 +253,15 @@ def stream(
             "--record-departures needs the camera: add --camera, or --camera-height and --field-of-view"
         )
     with ExitStack() as stack:
-        frames = stack.enter_context(open_source(source, fps))
+        frames = stack.enter_context(
+            open_source(
+                source,
+                fps,
+                reconnect_s=reconnect_camera,
+                rtsp_transport=rtsp_transport,
+                notify=partial(click.echo, err=True),
+            )
+        )
         service = stack.enter_context(_open_service(context.obj, **where))
         sinks = [
             stack.enter_context(json_lines_sink(jsonl)),
@@ -229,14 +270,22 @@ def stream(
         ]
         run = _StreamRun([sink for sink in sinks if sink is not None])
         mode = mode or ("latest" if frames.live else "all")
-        start = partial(service.stream, mode=mode, horizon=horizon, detector=detector, camera=camera, session=session)
+        start = partial(
+            service.stream,
+            mode=mode,
+            horizon=horizon,
+            detector=detector,
+            camera=camera,
+            kinds=kinds or None,
+            session=session,
+        )
         try:
             interrupted = run.process(start, frames, mode)
         except LanestreamError:
             if run.report.frames:
-                click.echo(run.report_text(service, detector), err=_is_stdout(jsonl))
+                click.echo(run.report_text(service, detector, frames.counts), err=_is_stdout(jsonl))
             raise
-        click.echo(run.report_text(service, detector), err=_is_stdout(jsonl))
+        click.echo(run.report_text(service, detector, frames.counts), err=_is_stdout(jsonl))
         for path in [] if clips is None else clips.paths:
             click.echo(f"departure: {path}", err=_is_stdout(jsonl))
     context.exit(_EXIT_INTERRUPTED if interrupted else 0)
@@ -263,7 +312,11 @@ class _StreamRun:
             results = start(newest or source.frames)
             interrupted = False
             try:
-                with closing(iter(results)) as iterator:
+                with closing(iter(results)) as iterator, ExitStack() as stops:
+                    # A thread of the stream may wait for a camera that is lost.
+                    stops.callback(source.stop)
+                    if newest is not None:
+                        stops.callback(newest.stop)
                     for result in iterator:
                         self._check_connection(results)
                         self._report_warnings(results)
@@ -278,9 +331,9 @@ class _StreamRun:
                 self._dropped = dropped + (newest.skipped if newest else 0)
         return interrupted
 
-    def report_text(self, service: LaneService, detector: DetectorName | None) -> str:
+    def report_text(self, service: LaneService, detector: DetectorName | None, source: SourceCounts) -> str:
         """Returns the report. Asks the service what it runs only if the stream did not say: it may be gone by now."""
-        return self.report.text(self._info or service.describe(detector), self._dropped)
+        return self.report.text(self._info or service.describe(detector), self._dropped, source)
 
     def _write(self, result: StreamResult) -> None:
         self.report.write_result(result)

@@ -46,17 +46,6 @@ def position_name(position: int) -> str:
     return POSITIONS.get(position, _OTHER)[1]
 
 
-# The number of dashes of a boundary in each state, and the share of a dash and its gap that is painted.
-_DASHES: Final[dict[str, tuple[int, float]]] = {"detected": (1, 1.0), "inferred": (4, 0.8), "predicted": (8, 0.5)}
-
-
-def dashes(state: str) -> list[tuple[float, float]]:
-    """Returns the start and the end of each dash of a boundary in that state, as shares of its length."""
-    count, painted = _DASHES[state]
-    length = count - 1.0 + painted
-    return [(start / length, (start + painted) / length) for start in range(count)]
-
-
 @dataclass(frozen=True)
 class Drawing:
     """An image to draw on. `scale` is the size of text and lines, 1 for an image 1280 pixels wide."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.client import responses
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 import httpx
@@ -29,8 +29,10 @@ from lanestream.errors import (
     SettingsError,
     TooOldError,
     error_from_code,
+    one_line,
 )
 from lanestream.protocol import SUBPROTOCOL
+from lanestream_client.proxies import Proxy, find_proxy
 
 # How long `ready` may take after a fast handshake: the service may first have to fetch the session from its store, or
 # to close the previous socket of the session.
@@ -59,24 +61,29 @@ _CLOSE_CODE_ERRORS: Final[Mapping[int, type[LanestreamError]]] = {
 }
 _MESSAGE_TOO_BIG: Final = 1009
 
+Transport = TypeVar("Transport", httpx.BaseTransport, httpx.AsyncBaseTransport)
+
 
 @dataclass(frozen=True)
 class Endpoint:
     """The address of one replica: `base` for people, `http` for requests, `stream` for WebSockets.
 
-    `headers` are sent with each request and each handshake. Neither `base` nor the representation holds a secret.
+    `headers` are sent with each request and each handshake. Both go through `proxy`, unless it is None. Neither `base`
+    nor the representation holds a secret.
     """
 
     base: str
     http: str = field(repr=False)
     stream: str = field(repr=False)
     headers: Mapping[str, str] = field(repr=False)
+    proxy: Proxy | None = None
 
     @classmethod
     def parse(cls, url: str, api_key: str | None = None) -> Endpoint:
         """Parses an http, https, ws or wss URL, with or without a path before `/v1`.
 
-        Raises SettingsError if the URL or the key is not valid.
+        Raises SettingsError if the URL, the key or the environment's proxy for the URL is not valid, and
+        MissingExtraError if that proxy needs packages that are missing.
         """
         invalid = SettingsError(f"{_without_login(url)!r} is not a valid service URL", _URL_HINT)
         try:
@@ -87,12 +94,19 @@ class Endpoint:
         if not valid:
             raise invalid
         address = parts.netloc + parts.path.removesuffix("/v1/stream").rstrip("/")
+        http = f"{_HTTP_SCHEMES[parts.scheme]}://{address}"
         return cls(
             base=_without_login(url),
-            http=f"{_HTTP_SCHEMES[parts.scheme]}://{address}",
+            http=http,
             stream=f"{_WEBSOCKET_SCHEMES[parts.scheme]}://{address}/v1/stream",
             headers=_headers(api_key),
+            proxy=find_proxy(http),
         )
+
+    @property
+    def without_proxy(self) -> str:
+        """What to do if the proxy is to blame."""
+        return f"check the proxy, or add {urlsplit(self.http).hostname} to NO_PROXY to connect without it"
 
 
 def parse_endpoints(url: str | Sequence[str], api_key: str | None = None) -> tuple[Endpoint, ...]:
@@ -108,6 +122,7 @@ def connect_options(endpoint: Endpoint, timeout: float) -> dict[str, Any]:
     return {
         "uri": endpoint.stream,
         "subprotocols": [Subprotocol(SUBPROTOCOL)],
+        "proxy": None if endpoint.proxy is None else endpoint.proxy.url,
         "compression": None,
         "additional_headers": endpoint.headers,
         "open_timeout": timeout,
@@ -120,6 +135,13 @@ def connect_options(endpoint: Endpoint, timeout: float) -> dict[str, Any]:
     }
 
 
+def http_options(endpoints: Sequence[Endpoint], transport: Callable[..., Transport]) -> dict[str, Any]:
+    """Returns the arguments for either of httpx's clients that decide how to connect; `transport` is the class."""
+    # With a transport of its own, a client does not read the variables for proxies.
+    proxied = {endpoint.http: transport(proxy=endpoint.proxy.url) for endpoint in endpoints if endpoint.proxy}
+    return {"transport": transport(), "mounts": proxied}
+
+
 @contextmanager
 def websocket_errors(endpoint: Endpoint) -> Iterator[None]:
     """Converts websockets' exceptions in the block to LanestreamErrors."""
@@ -128,9 +150,9 @@ def websocket_errors(endpoint: Endpoint) -> Iterator[None]:
     except ConnectionClosed as error:
         raise closed_error(error) from None
     except InvalidStatus as error:
-        raise refusal_error(error.response.status_code, error.response.body or b"", endpoint.base) from None
+        raise refusal_error(error.response.status_code, error.response.body or b"", endpoint) from None
     except (OSError, WebSocketException) as error:
-        raise _unreachable_error(endpoint.base, error) from None
+        raise _unreachable_error(endpoint, error) from None
 
 
 @contextmanager
@@ -139,7 +161,7 @@ def http_errors(endpoint: Endpoint) -> Iterator[None]:
     try:
         yield
     except httpx.HTTPError as error:
-        raise _unreachable_error(endpoint.base, error) from None
+        raise _unreachable_error(endpoint, error) from None
 
 
 def closed_error(closed: ConnectionClosed) -> LanestreamError:
@@ -154,21 +176,26 @@ def closed_error(closed: ConnectionClosed) -> LanestreamError:
     return kind(f"the service closed the stream with code {close.code}{reason}")
 
 
-def refusal_error(status: int, body: bytes | bytearray, url: str) -> LanestreamError:
+def refusal_error(status: int, body: bytes | bytearray, endpoint: Endpoint) -> LanestreamError:
     """Returns the error in an unsuccessful response, or a ConnectionFailedError if it is not from Lanestream."""
     try:
         problem: dict[str, Any] = json.loads(body)
         return error_from_code(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
     except (ValueError, TypeError, KeyError):
-        answer = f"{status} {responses.get(status, '')}".rstrip()
-        return ConnectionFailedError(f"{url} answered {answer}", "check that a Lanestream service runs at this URL")
+        answer = f"{endpoint.base} answered {status} {responses.get(status, '')}".rstrip()
+    if endpoint.proxy is not None:
+        return ConnectionFailedError(f"{answer} through {endpoint.proxy}", endpoint.without_proxy)
+    return ConnectionFailedError(answer, "check that a Lanestream service runs at this URL")
 
 
-def _unreachable_error(url: str, error: Exception) -> ConnectionFailedError:
+def _unreachable_error(endpoint: Endpoint, error: Exception) -> ConnectionFailedError:
     timed_out = isinstance(error, TimeoutError | httpx.TimeoutException)
     reason = "the connection timed out" if timed_out else re.sub(r"^\[Errno -?\d+\] ", "", str(error))
-    reason = reason or type(error).__name__
-    return ConnectionFailedError(f"can't reach the service at {url}: {reason}", "start one with `lanestream serve`")
+    reason = one_line(reason) or type(error).__name__
+    failure = f"can't reach the service at {endpoint.base}"
+    if endpoint.proxy is not None:
+        return ConnectionFailedError(f"{failure} through {endpoint.proxy}: {reason}", endpoint.without_proxy)
+    return ConnectionFailedError(f"{failure}: {reason}", "start one with `lanestream serve`")
 
 
 def _headers(api_key: str | None) -> dict[str, str]:

@@ -1,10 +1,10 @@
-"""A frame on its way from a source to the service, and the result that comes back for it."""
+"""Sources of frames, a frame on its way from one to the service, and the result that comes back for it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Literal
 
 from lanestream.errors import ImageError, needs_extra
 from lanestream.protocol import ErrorMessage, Indicator, LanesMessage
@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
     BgrImage = NDArray[np.uint8]  # (H, W, 3)
 
+# Where a capture time is from: the file or the camera itself, the arrival of the frame here, or only the number of the
+# frame and the frame rate.
+Clock = Literal["source", "arrival", "frame_rate"]
+
 # High enough that compression artifacts do not disturb the detectors.
 _JPEG_QUALITY: Final = 90
 
@@ -24,7 +28,8 @@ class SourceFrame:
     """A frame as its source delivers it: an image file in `data`, or decoded `pixels`, BGR (H, W, 3) uint8.
 
     `timestamp` is the capture time in seconds on the source's clock. If it is None, the receiver assigns one. `speed`
-    in m/s and `indicator` are the vehicle's then, for lane departure warnings.
+    in m/s and `indicator` are the vehicle's then, for lane departure warnings. `clock` says where the capture time is
+    from, and `reconnects` how often the source had been lost and opened again before this frame.
     """
 
     seq: int
@@ -34,6 +39,8 @@ class SourceFrame:
     name: str = ""
     speed: float | None = None
     indicator: Indicator | None = None
+    clock: Clock | None = None
+    reconnects: int = 0
 
     def encoded(self) -> bytes:
         """Returns the frame as an image file: the original file, or a JPEG of `pixels`."""
@@ -57,6 +64,36 @@ class SourceFrame:
         if image is None:
             raise ImageError(f"{self.name or 'the frame'} can't be decoded")
         return np.asarray(image, np.uint8)
+
+
+@dataclass
+class SourceCounts:
+    """What a source has lost so far: frames that were damaged or empty, and its connections.
+
+    `outage_s` is the time in seconds without frames, from the last one before to the first one after each outage.
+    """
+
+    lost_frames: int = 0
+    reconnects: int = 0
+    outage_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class CameraSource:
+    """The frames of one camera, to be read once.
+
+    A `live` source delivers frames at its own pace; any other delivers them as fast as they are read. `length` is the
+    number of frames if known, `fps` the rate at which to play them. `counts` says what was lost so far. `stop` ends the
+    frames of a live source, also from another thread.
+    """
+
+    name: str
+    frames: Iterator[SourceFrame]
+    live: bool
+    fps: float
+    length: int | None = None
+    counts: SourceCounts = field(default_factory=SourceCounts)
+    stop: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from lanestream.errors import LanestreamError
 from lanestream.protocol import (
+    BoundaryKind,
     CameraModel,
     DepartureOptions,
     DetectorName,
@@ -69,6 +70,7 @@ class LaneService(Protocol):
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
     ) -> LanesMessage:
         """Returns the lanes of one image file."""
         ...
@@ -82,6 +84,7 @@ class LaneService(Protocol):
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         departure: DepartureOptions | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
         session: str | None = None,
     ) -> ResultStream:
         """Returns the results of one camera's frames."""
@@ -146,6 +149,7 @@ class InProcessEngine(Protocol):
         camera: CameraModel | None = None,
         departure: DepartureOptions | None = None,
         *,
+        kinds: Sequence[BoundaryKind] | None = None,
         single_image: bool = False,
     ) -> InProcessSession:
         """Opens a session for one camera, or for a single image. Raises NoDetectorError."""
@@ -173,9 +177,10 @@ class InProcessClient:
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
     ) -> LanesMessage:
         """Returns the lanes of one image file. Raises ImageError, SourceError and NoDetectorError."""
-        session = self._engine.open_camera(horizon, detector, camera, single_image=True)
+        session = self._engine.open_camera(horizon, detector, camera, kinds=kinds, single_image=True)
         return session.lanes(read_image_file(image), seq=0, timestamp=0.0)
 
     def stream(
@@ -187,6 +192,7 @@ class InProcessClient:
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         departure: DepartureOptions | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
         session: str | None = None,
     ) -> InProcessStream:
         """Returns the results of one camera's frames. In either mode a frame is read when the previous one is done.
@@ -194,7 +200,8 @@ class InProcessClient:
         Raises NoDetectorError if the detector is not loaded.
         """
         del mode, session  # frames are never queued, so no mode applies; streams are not logged
-        return InProcessStream(self._engine.open_camera(horizon, detector, camera, departure), as_source_frames(frames))
+        opened = self._engine.open_camera(horizon, detector, camera, departure, kinds=kinds)
+        return InProcessStream(opened, as_source_frames(frames))
 
 
 class InProcessStream:

@@ -6,6 +6,7 @@ The blocking and the async client share this module.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pydantic import ValidationError
 
 from lanestream.errors import NoDetectorError, ProtocolError, SourceError
 from lanestream.protocol import (
+    BoundaryKind,
     CameraModel,
     DepartureOptions,
     DetectorName,
@@ -22,7 +24,7 @@ from lanestream.protocol import (
     StartMessage,
     parse_client_message,
 )
-from lanestream_client.endpoint import refusal_error
+from lanestream_client.endpoint import Endpoint, refusal_error
 
 
 @dataclass(frozen=True)
@@ -47,16 +49,25 @@ def read_image_file(image: bytes | str | Path) -> bytes:
 
 
 def detect_query(
-    horizon: float | None, detector: DetectorName | None, camera: CameraModel | None
-) -> dict[str, float | str]:
-    """Returns the query parameters of `/v1/detect`."""
-    given: dict[str, float | str | None] = {"horizon": horizon, "detector": detector}
+    horizon: float | None,
+    detector: DetectorName | None,
+    camera: CameraModel | None,
+    kinds: Sequence[BoundaryKind] | None,
+) -> dict[str, float | str | list[str]]:
+    """Returns the query parameters of `/v1/detect`. Raises ProtocolError if `kinds` is empty."""
+    if kinds is not None and not kinds:
+        raise ProtocolError("no kind of boundaries is to be reported", "give marking, road_edge or both")
+    given: dict[str, float | str | list[str] | None] = {
+        "horizon": horizon,
+        "detector": detector,
+        "kinds": None if kinds is None else list(kinds),
+    }
     if camera is not None:
         given |= _camera_parameters(camera)
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _camera_parameters(camera: CameraModel) -> dict[str, float | str | None]:
+def _camera_parameters(camera: CameraModel) -> dict[str, float | str | list[str] | None]:
     """Returns the query parameters of a camera: two numbers, which older services know too, or all as JSON."""
     if camera.model_dump(exclude_defaults=True).keys() == {"height", "field_of_view"}:
         return {"camera_height": camera.height, "field_of_view": camera.field_of_view}
@@ -69,6 +80,7 @@ def start_message(
     detector: DetectorName | None,
     camera: CameraModel | None,
     departure: DepartureOptions | None,
+    kinds: Sequence[BoundaryKind] | None,
     session: str | None,
 ) -> StartMessage:
     """Returns the message that opens a stream. Raises ProtocolError if an argument is not valid."""
@@ -79,6 +91,7 @@ def start_message(
         "detector": detector,
         "camera": None if camera is None else camera.model_dump(exclude_defaults=True),
         "departure": None if departure is None else departure.model_dump(),
+        "kinds": None if kinds is None else list(kinds),
         "session": session,
     }
     try:
@@ -90,11 +103,11 @@ def start_message(
     return message
 
 
-def check_response(response: httpx.Response) -> httpx.Response:
+def check_response(response: httpx.Response, endpoint: Endpoint) -> httpx.Response:
     """Returns the response if it is successful. Raises the error that the service sent otherwise."""
     if response.is_success:
         return response
-    raise refusal_error(response.status_code, response.content, str(response.url.copy_with(userinfo=b"")))
+    raise refusal_error(response.status_code, response.content, endpoint)
 
 
 def parse_lanes(response: httpx.Response) -> LanesMessage:

@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import needs_extra
-from lanestream_client.drawing import ALERT, CAUTION, WHITE, Color, Drawing, dashes, position_color
+from lanestream_client.drawing import ALERT, CAUTION, WHITE, Color, Drawing, position_color
+from lanestream_client.line_styles import line_style
 
 with needs_extra("video"):
     import numpy as np
@@ -34,6 +35,9 @@ _SIDE_M: Final = 7.0
 _GRID_M: Final = (10.0, 20.0, 30.0, 40.0)
 _VEHICLE_M: Final = (4.4, 1.8)
 _SAMPLES: Final = 48
+# On the map, in meters: the width of a line, and the distance and the length of the ticks of a road edge.
+_LINE_M: Final = 0.35
+_TICKS_M, _TICK_M = 4.0, 0.6
 # A normal distribution has 95 % within this many sigmas.
 _SIGMAS: Final = 1.96
 # A wider lane half than this many lane widths is cut off on the offset bar.
@@ -155,15 +159,30 @@ def _draw_map(drawing: Drawing, lanes: list[LaneModel]) -> None:
     for lane in lanes:
         _draw_band(drawing, lane)
     for lane in lanes:
-        color = position_color(lane.position)
-        for piece in dashes(lane.state):
-            x = np.linspace(*(piece[0] * _AHEAD_M, piece[1] * _AHEAD_M), _SAMPLES)
-            drawing.line(_map_points(x, _lateral(lane, x), width, height), color, 2.0)
+        _draw_line(drawing, lane)
     length, breadth = _VEHICLE_M
     corners = np.array([[-length, breadth], [0.0, breadth], [0.0, -breadth], [-length, -breadth]]) / np.array(
         [1.0, 2.0]
     )
     drawing.polygon(_map_points(corners[:, 0], corners[:, 1], width, height), WHITE)
+
+
+def _draw_line(drawing: Drawing, lane: LaneModel) -> None:
+    """Draws a boundary in its style."""
+    height, width = drawing.image.shape[:2]
+    style = line_style(lane)
+    for start, end in style.pieces:
+        x = np.linspace(start * _AHEAD_M, end * _AHEAD_M, _SAMPLES)
+        for strand in style.strands:
+            points = _map_points(x, _lateral(lane, x) - strand.middle * _LINE_M, width, height)
+            drawing.line(points, style.color, 2.0 * strand.width)
+            if style.core is not None:
+                drawing.line(points, style.core, 1.0)
+    if style.ticks:
+        for at in np.arange(1.0, _AHEAD_M, _TICKS_M):
+            x = np.array([at, at])
+            y = _lateral(lane, x) - np.array([0.0, style.ticks * _TICK_M])
+            drawing.line(_map_points(x, y, width, height), style.color, 1.0)
 
 
 def _draw_band(drawing: Drawing, lane: LaneModel) -> None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import av
 
     from lanestream.protocol import LanesMessage
-    from lanestream_client.frames import BgrImage, StreamResult
+    from lanestream_client.frames import BgrImage, SourceCounts, StreamResult
     from lanestream_client.requests import ServiceInfo
 
 # The frame times of 24, 25, 29.97, 30, 50 and 60 fps are multiples of it, and it fits into MPEG-4's 16 bits.
@@ -38,7 +38,11 @@ class ResultSink(Protocol):
 
 
 class JsonLinesSink:
-    """Writes one message per line, in front of it the field `file` if the frame has a file name."""
+    """Writes one message per line, with what is known about its frame.
+
+    Before the message that is its `file` if it has a name. Behind it is the `clock` that its time is from, and in how
+    many `reconnects` its source had been lost before, if any.
+    """
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
@@ -47,8 +51,12 @@ class JsonLinesSink:
         """Writes the frame's lanes or its error."""
         message = result.lanes or result.error
         if message is not None:
-            name = {"file": result.frame.name} if result.frame.name else {}
-            self._file.write(json.dumps({**name, **message.model_dump(mode="json")}) + "\n")
+            frame = result.frame
+            fields = {"file": frame.name, **message.model_dump(mode="json")}
+            fields |= {"clock": frame.clock, "reconnects": frame.reconnects}
+            unknown = {name for name in ("file", "clock", "reconnects") if not fields[name]}
+            known = {name: value for name, value in fields.items() if name not in unknown}
+            self._file.write(json.dumps(known) + "\n")
 
 
 @contextmanager
@@ -166,8 +174,8 @@ class RunReport:
         """Counts a frame that failed."""
         self.failed += 1
 
-    def text(self, info: ServiceInfo, dropped: int = 0) -> str:
-        """Returns the report. `dropped` is the number of frames without any result."""
+    def text(self, info: ServiceInfo, dropped: int = 0, source: SourceCounts | None = None) -> str:
+        """Returns the report. `dropped` is the number of frames without any result, `source` what the source lost."""
         answered = len(self._timings)
         rate = answered / max(time.monotonic() - self._started, 1e-9)
         lost = f", {self.lost} lost" if self.lost else ""
@@ -179,12 +187,21 @@ class RunReport:
             share = 100.0 * self._with_both_ego_boundaries / answered
             lines += [f"both ego boundaries in {share:.1f} % of the answered frames", ""]
             lines += [f"{'ms':<8}{'p50':>9}{'p95':>9}", *(self._stage(stage) for stage in TimingModel.model_fields), ""]
+        if source is not None and source.lost_frames:
+            lines.append(f"the source lost {_counted(source.lost_frames, 'damaged frame')}")
+        if source is not None and source.reconnects:
+            times = _counted(source.reconnects, "time")
+            lines.append(f"the camera was opened again {times}, with {source.outage_s:.1f} s without frames")
         lines.append(f"model {info.model} on {info.provider}")
         return "\n".join(lines)
 
     def _stage(self, stage: str) -> str:
         values = sorted(getattr(timing, stage) for timing in self._timings)
         return f"{stage:<8}{nearest_rank(values, 50):>9.2f}{nearest_rank(values, 95):>9.2f}"
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def nearest_rank(ordered: Sequence[float], percent: float) -> float:

@@ -2,43 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
-from urllib.parse import urlsplit
 
-from lanestream.errors import SourceError, needs_extra
-from lanestream_client.frames import SourceFrame
+from lanestream.errors import SourceError
+from lanestream_client.frames import CameraSource, SourceFrame
+from lanestream_client.video_sources import SOURCE_HINT, open_camera, open_network_stream, open_video_file
 
 if TYPE_CHECKING:
-    import av
-    import cv2
-
-    from lanestream_client.frames import BgrImage
+    from lanestream_client.video_sources import RtspTransport
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp")
-_HINT: Final = "use a video file, a folder of images, an image, a camera number or an rtsp:// or http:// URL"
-_NETWORK_TIMEOUT_S: Final = 10.0
+# How long a live camera is opened again by default. Many need most of a minute to start.
+RECONNECT_CAMERA_S: Final = 60.0
+# How long to wait for the thread of a camera that does not answer. It ends by itself when its wait for data ends.
+_JOIN_S: Final = 1.0
 
-
-@dataclass(frozen=True)
-class CameraSource:
-    """The frames of one camera, to be read once.
-
-    A `live` source delivers frames at its own pace; any other delivers them as fast as they are read. `length` is the
-    number of frames if known, `fps` the rate at which to play them.
-    """
-
-    name: str
-    frames: Iterator[SourceFrame]
-    live: bool
-    fps: float
-    length: int | None = None
+_log: Final = logging.getLogger(__name__)
 
 
 class NewestFrames:
@@ -63,16 +48,23 @@ class NewestFrames:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.stop()
+        self._thread.join(_JOIN_S)
+
+    def stop(self) -> None:
+        """Ends the iteration, also while another thread waits for a frame."""
         with self._changed:
             self._stopped = True
-        self._thread.join()
+            self._changed.notify_all()
 
     def __iter__(self) -> Iterator[SourceFrame]:
         return self
 
     def __next__(self) -> SourceFrame:
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None or self._ended)
+            self._changed.wait_for(lambda: self._newest is not None or self._ended or self._stopped)
+            if self._stopped:
+                raise StopIteration
             frame, self._newest = self._newest, None
             if frame is not None:
                 return frame
@@ -97,21 +89,35 @@ class NewestFrames:
                 self._changed.notify()
 
 
-def open_source(spec: str, fps: float = 25.0) -> AbstractContextManager[CameraSource]:
-    """Opens the source that `spec` names. `fps` sets the timestamps of image files, which have none.
+def open_source(
+    spec: str,
+    fps: float = 25.0,
+    *,
+    reconnect_s: float = RECONNECT_CAMERA_S,
+    rtsp_transport: RtspTransport = "auto",
+    notify: Callable[[str], None] = _log.warning,
+) -> AbstractContextManager[CameraSource]:
+    """Opens the source that `spec` names: a video, a folder of images, an image, a camera's number or a URL.
 
-    Raises SourceError if the source does not exist or can't be read, and, while it is read, if it has no frames.
+    `fps` sets the timestamps of image files, which have none. A live camera that is lost is opened again for up to
+    `reconnect_s` seconds, 0 disables this, and `notify` gets a line of text when it is lost and when it is back. RTSP
+    streams are requested over TCP and if that fails over UDP, or over one of them only.
+
+    Raises SourceError if the source does not exist or can't be read, and, while it is read, if it has no frames, and
+    its subclass CameraLostError if a live camera does not come back.
     """
     if spec.isdecimal():
-        return _camera(int(spec))
+        return open_camera(int(spec), reconnect_s, notify)
     if "://" in spec:
-        return _video(spec, _without_login(spec))
+        return open_network_stream(spec, reconnect_s, rtsp_transport, notify)
     path = Path(spec)
     if path.is_dir():
         return _images(spec, image_files(path), fps)
     if not path.exists():
-        raise SourceError(f"no such file or folder: {spec}", _HINT)
-    return _images(spec, [path], fps) if path.suffix.lower() in IMAGE_SUFFIXES else _video(spec, spec)
+        raise SourceError(f"no such file or folder: {spec}", SOURCE_HINT)
+    if path.is_char_device():
+        return open_camera(spec, reconnect_s, notify)
+    return _images(spec, [path], fps) if path.suffix.lower() in IMAGE_SUFFIXES else open_video_file(spec)
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -126,92 +132,13 @@ def _natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name.lower())]
 
 
-def _without_login(url: str) -> str:
-    parts = urlsplit(url)
-    return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
-
-
 @contextmanager
 def _images(name: str, files: list[Path], fps: float) -> Iterator[CameraSource]:
     def frames() -> Iterator[SourceFrame]:
         for seq, path in enumerate(files):
             try:
-                yield SourceFrame(seq, seq / fps, data=path.read_bytes(), name=path.name)
+                yield SourceFrame(seq, seq / fps, data=path.read_bytes(), name=path.name, clock="frame_rate")
             except OSError as error:
                 raise SourceError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
 
     yield CameraSource(name, frames(), live=False, fps=fps, length=len(files))
-
-
-@contextmanager
-def _video(location: str, name: str) -> Iterator[CameraSource]:
-    """Opens a video file or a network stream. A network stream without a known duration is live."""
-    with needs_extra("video"):
-        import av
-    remote = "://" in location
-    options = {"rtsp_transport": "tcp"} if location.startswith("rtsp") else {}
-    try:
-        container = av.open(location, options=options, timeout=_NETWORK_TIMEOUT_S if remote else None)
-    except (av.FFmpegError, OSError) as error:
-        raise SourceError(f"can't open {name}: {_reason(error)}", _HINT) from None
-    with container:
-        if not container.streams.video:
-            raise SourceError(f"{name} has no video stream", _HINT)
-        stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
-        fps = float(stream.average_rate or stream.guessed_rate or 25)
-        live = remote and container.duration is None
-        yield CameraSource(name, _decoded(container, name, fps), live=live, fps=fps, length=stream.frames or None)
-
-
-def _decoded(container: av.container.InputContainer, name: str, fps: float) -> Iterator[SourceFrame]:
-    import av
-
-    seq = 0
-    try:
-        for seq, frame in enumerate(container.decode(video=0), 1):
-            timestamp = (seq - 1) / fps if frame.time is None else frame.time
-            yield SourceFrame(seq - 1, timestamp, pixels=_upright(frame))
-    except (av.FFmpegError, OSError) as error:
-        raise SourceError(f"{name} failed after {seq} frames: {_reason(error)}") from None
-    if seq == 0:
-        raise SourceError(f"{name} has no frames")
-
-
-def _upright(frame: av.VideoFrame) -> BgrImage:
-    import numpy as np
-
-    pixels = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
-    quarter_turns = round(frame.rotation / 90) % 4
-    return np.ascontiguousarray(np.rot90(pixels, quarter_turns)) if quarter_turns else pixels
-
-
-def _reason(error: Exception) -> str:
-    return (getattr(error, "strerror", None) or str(error)).lower()
-
-
-@contextmanager
-def _camera(number: int) -> Iterator[CameraSource]:
-    with needs_extra("video"):
-        import cv2
-    capture = cv2.VideoCapture(number)
-    try:
-        if not capture.isOpened():
-            raise SourceError(f"camera {number} was not found, or another program uses it", _HINT)
-        yield CameraSource(
-            f"camera {number}", _captured(capture, number), live=True, fps=capture.get(cv2.CAP_PROP_FPS) or 30.0
-        )
-    finally:
-        capture.release()
-
-
-def _captured(capture: cv2.VideoCapture, number: int) -> Iterator[SourceFrame]:
-    import numpy as np
-
-    seq = 0
-    while True:
-        success, pixels = capture.read()
-        if not success:
-            raise SourceError(f"camera {number} stopped delivering frames")
-        yield SourceFrame(seq, time.monotonic(), pixels=np.asarray(pixels, np.uint8))
-        seq += 1

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lanestream.errors import CheckpointError
+from lanestream.road.appearance import BOUNDARY_KINDS, MARKING_COLORS, MARKING_TYPES
+from lanestream_exporter.weight_files import load_state, weights_in
 
 # Added to a patch's contrast (1 is full scale), so that the noise of an empty patch is not amplified to a texture.
 LEAST_CONTRAST = 0.03
@@ -24,6 +25,7 @@ _CONVOLUTIONS = (0, 3, 6, 8, 10)
 _CHANNELS = (64, 192, 384, 256, 256)
 _HIDDEN = (1, 4)
 _NORMS = ("norms.", "hidden_norms.")
+_LAST = "classifier.6."
 
 
 @dataclass(frozen=True)
@@ -55,14 +57,34 @@ class Shape:
 # The size of the published network and of torchvision's checkpoints.
 FULL = Shape()
 
+# The kinds of a candidate: nothing, or one of BOUNDARY_KINDS.
+KINDS = 1 + len(BOUNDARY_KINDS)
+OUTPUTS = KINDS + len(MARKING_TYPES) + len(MARKING_COLORS)
+
+
+@dataclass(frozen=True)
+class ClassifierLogits:
+    """The classifier's logits by meaning: `kinds` (N, 3), `types` (N, 4) and `colors` (N, 2)."""
+
+    kinds: Tensor
+    types: Tensor
+    colors: Tensor
+
+    @classmethod
+    def of(cls, logits: Tensor) -> ClassifierLogits:
+        """Returns the parts of logits (N, OUTPUTS)."""
+        return cls(*torch.split(logits, [KINDS, len(MARKING_TYPES), len(MARKING_COLORS)], dim=1))
+
 
 class AlexNet(nn.Module):
-    """The network for `classes` classes; `batch_norm` adds a batch normalization after each layer but the last.
+    """The network with `outputs` outputs; `batch_norm` adds a batch normalization after each layer but the last.
 
     Without normalization most hidden units die in the first hundred steps.
     """
 
-    def __init__(self, classes: int = 2, shape: Shape = FULL, *, batch_norm: bool = True, dropout: float = 0.5) -> None:
+    def __init__(
+        self, outputs: int = OUTPUTS, shape: Shape = FULL, *, batch_norm: bool = True, dropout: float = 0.5
+    ) -> None:
         super().__init__()
         self.shape = shape
         first, second, third, fourth, last = shape.channels
@@ -92,11 +114,11 @@ class AlexNet(nn.Module):
             nn.Dropout(dropout),
             nn.Linear(shape.hidden, shape.hidden),
             nn.ReLU(),
-            nn.Linear(shape.hidden, classes),
+            nn.Linear(shape.hidden, outputs),
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Returns logits (N, classes) of normalized RGB images (N, 3, size, size)."""
+        """Returns logits (N, outputs) of normalized RGB images (N, 3, size, size)."""
         for index, layer in enumerate(self.features):
             x = layer(x)
             if str(index) in self.norms:
@@ -115,7 +137,7 @@ class AlexNet(nn.Module):
 
     def folded(self) -> AlexNet:
         """Returns the same function as a plain AlexNet: each normalization is folded into the layer before it."""
-        plain = AlexNet(self.classes, self.shape, batch_norm=False)
+        plain = AlexNet(self.outputs, self.shape, batch_norm=False)
         plain.load_state_dict({k: v.clone() for k, v in self.state_dict().items() if not k.startswith(_NORMS)})
         for key, norm in self.norms.items():
             assert isinstance(norm, nn.BatchNorm2d)  # noqa: S101 - as above
@@ -132,8 +154,8 @@ class AlexNet(nn.Module):
         return plain.eval()
 
     @property
-    def classes(self) -> int:
-        """The number of classes."""
+    def outputs(self) -> int:
+        """The number of outputs."""
         last = self.classifier[6]
         assert isinstance(last, nn.Linear)  # noqa: S101 - as above
         return last.out_features
@@ -155,29 +177,19 @@ def normalize(patches: Tensor) -> Tensor:
 def load_torchvision_weights(network: AlexNet, weights: Path) -> None:
     """Loads the convolutions and hidden layers of a torchvision AlexNet checkpoint; the last layer stays random.
 
-    Raises CheckpointError if the file is not such a checkpoint, or if the network has another size.
+    Normalization layers are loaded too if the checkpoint has them. Raises CheckpointError if the file is not such a
+    checkpoint, or if the network has another size.
     """
-    state = load_state(weights)
-    if network.shape != FULL:
+    state = weights_in(load_state(weights))
+    has_norms = any(key.startswith(_NORMS) for key in state)
+    left_out = (_LAST,) if has_norms else (_LAST, *_NORMS)
+    wanted = {k: v for k, v in network.state_dict().items() if not k.startswith(left_out)}
+    wrong = [key for key, value in wanted.items() if key not in state or state[key].shape != value.shape]
+    if wrong and network.shape != FULL:
         full = "set " + ", ".join(f"{key} = {value}" for key, value in asdict(FULL).items())
         raise CheckpointError(
             f"{weights} is not a checkpoint of a run, and the network is smaller than torchvision's", full
         )
-    wanted = {k: v for k, v in network.state_dict().items() if not k.startswith((*_NORMS, "classifier.6."))}
-    wrong = [key for key, value in wanted.items() if key not in state or state[key].shape != value.shape]
     if wrong:
         raise CheckpointError(f"{weights} lacks {wrong[0]} of a torchvision AlexNet", "give its weights")
     network.load_state_dict({key: state[key] for key in wanted}, strict=False)
-
-
-def load_state(path: Path) -> dict[str, Any]:
-    """Returns the dictionary in a PyTorch file without running code from it. Raises CheckpointError with one line."""
-    if not path.is_file():
-        raise CheckpointError(f"no checkpoint at {path}", "give the path of a .pt file")
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises many types, with pages of advice, for other files
-        raise CheckpointError(f"{path} is not a PyTorch checkpoint", "give a file that holds only weights") from error
-    if not isinstance(state, dict):
-        raise CheckpointError(f"{path} holds a {type(state).__name__}", "give a file that holds a state_dict")
-    return state

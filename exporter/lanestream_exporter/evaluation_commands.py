@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _REGRESSOR: Final = "Regressor whose ego-lane prior the classifiers use, or `none`.  [default: the shipped one]"
 # Columns of the tables, even if the terminal has fewer.
-_MIN_WIDTH: Final = 100
+_MIN_WIDTH: Final = 130
 _MIN_TRACKING_WIDTH: Final = 150
 
 
@@ -90,6 +90,8 @@ def evaluate(
     )
     figures = evaluation.figures()
     console = Console(width=max(_MIN_WIDTH, Console().width))
+    for line in figures["verdicts"]:
+        click.echo(line)
     for table in figure_tables(figures):
         console.print(table)
     if out is not None:

@@ -113,14 +113,15 @@ def _with_prior(network: ExportableNetwork, regressor: Path | None) -> Exportabl
 
 
 def _datasets(training: dict[str, Any], data: Path | None) -> DatasetCollection | None:
-    """Returns the data sets of the manifest that a network was trained with; None if its frames are not available.
+    """Returns the data sets that a network was trained with; None if their frames are not available.
 
     The shipped manifest is only used with a data folder, `data`.
     """
-    manifest = training.get("config", {}).get("data", {}).get("manifest")
+    recipe = training.get("config", {}).get("data", {})
+    manifest = recipe.get("manifest")
     if manifest is not None and Path(manifest).is_file():
-        return DatasetCollection.open(Path(manifest), data)
-    return None if data is None else DatasetCollection.open(None, data)
+        return DatasetCollection.open(Path(manifest), data).without(recipe.get("without", ()))
+    return None if data is None else DatasetCollection.open(None, data).without(recipe.get("without", ()))
 
 
 def _foreign_network(

@@ -1,8 +1,9 @@
 """The lane regressor in PyTorch: AlexNet up to its first hidden layer, then 16 units, then two parabolas.
 
 Source: MathWorks, "Deep learning for automated driving, part 2: lane detection", 2017: the network regresses the
-coefficients of both boundaries of the ego lane. This one also predicts the presence and the standard deviation of each
-boundary and the horizon, and it learns from lateral errors at rows rather than from errors of the coefficients.
+coefficients of both boundaries of the ego lane. This one also predicts the presence, the kind and the standard
+deviation of each boundary and the horizon, and it learns from lateral errors at rows rather than from errors of the
+coefficients.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ class LaneRegressor(nn.Module):
         self.features, self.norms = trunk.features, trunk.norms
         self.hidden = nn.Sequential(nn.Dropout(dropout), *_linear(size.features, size.hidden, batch_norm), nn.ReLU())
         self.column_head = nn.Sequential(*_linear(size.hidden, 16, batch_norm), nn.ReLU(), nn.Linear(16, 6))
-        self.auxiliary_head = nn.Linear(size.hidden, 9)
+        self.auxiliary_head = nn.Linear(size.hidden, 11)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Returns raw outputs (N, 15) of normalized road crops (N, 3, size, size).
+        """Returns raw outputs (N, 17) of normalized road crops (N, 3, size, size).
 
         They are columns at the anchors, in image widths from the typical ones, logarithms of their standard deviations,
-        presence logits, and the horizon's offset as a share of the rows below the assumed horizon.
+        presence logits, the horizon's offset as a share of the rows below the assumed horizon, and road edge logits.
         """
         for index, layer in enumerate(self.features):
             x = layer(x)
@@ -81,28 +82,33 @@ def _linear(inputs: int, outputs: int, batch_norm: bool) -> list[nn.Module]:
 
 @dataclass(frozen=True)
 class RegressorPrediction:
-    """Raw outputs by meaning: columns (N, 2, 3), log deviations (N, 2, 3), presence logits (N, 2), horizon (N,)."""
+    """Raw outputs by meaning: columns and log deviations (N, 2, 3), presence logits (N, 2), horizon (N,).
+
+    `road_edge` (N, 2) are the logits of a boundary being an edge of the road rather than a marking.
+    """
 
     columns: Tensor
     log_deviations: Tensor
     presence: Tensor
     horizon: Tensor
+    road_edge: Tensor
 
     @classmethod
     def of(cls, raw: Tensor) -> RegressorPrediction:
-        """Returns the prediction in raw outputs (N, 15)."""
+        """Returns the prediction in raw outputs (N, 17)."""
         typical = torch.tensor(_TYPICAL, dtype=raw.dtype)
         logs = raw[:, 6:12].view(-1, 2, 3).clamp(_MIN_LOG, _MAX_LOG)
-        return cls(raw[:, :6].view(-1, 2, 3) + typical, logs, raw[:, 12:14], raw[:, 14])
+        return cls(raw[:, :6].view(-1, 2, 3) + typical, logs, raw[:, 12:14], raw[:, 14], raw[:, 15:17])
 
     def served(self) -> Tensor:
-        """Returns outputs (N, 15) in the layout of `lanestream.detection.ego_prior.RegressorOutput`."""
+        """Returns outputs (N, 17) in the layout of `lanestream.detection.ego_prior.RegressorOutput`."""
         return torch.cat(
             [
                 self.columns.flatten(1),
                 self.log_deviations.exp().flatten(1),
                 torch.sigmoid(self.presence),
                 self.horizon[:, None],
+                torch.sigmoid(self.road_edge),
             ],
             dim=1,
         )
@@ -122,7 +128,7 @@ def logs_at_shares() -> Tensor:
 
 
 def lateral_loss(prediction: RegressorPrediction, targets: dict[str, Tensor]) -> Tensor:
-    """Returns the loss of lateral errors at rows, of their predicted deviations, of presence and of the horizon.
+    """Returns the loss of lateral errors at rows, of their predicted deviations, of presence, kind and horizon.
 
     `targets` are the stacked fields of `road_crops.RegressionTarget`. Errors far away, where a meter has fewer pixels,
     weigh more. The deviations learn from the lateral errors without influencing them.
@@ -134,9 +140,16 @@ def lateral_loss(prediction: RegressorPrediction, targets: dict[str, Tensor]) ->
     lateral = (torch.where(error < 0.004, error**2 / 0.008, error - 0.002) * weight).sum() / weight.sum().clamp(min=1.0)
     logs = prediction.log_deviations @ logs_at_shares().T
     deviation = ((error.detach() / logs.exp() + logs) * known).sum() / known.sum().clamp(min=1.0)
-    labeled = (targets["presence"] >= 0.0).float()
-    presence = functional.binary_cross_entropy_with_logits(
-        prediction.presence, targets["presence"].clamp(min=0.0), weight=labeled, reduction="sum"
-    ) / labeled.sum().clamp(min=1.0)
-    horizon = (prediction.horizon - targets["horizon"]).abs().mean()
-    return 30.0 * lateral + 0.1 * deviation + 0.3 * presence + 5.0 * horizon
+    presence = _binary_loss(prediction.presence, targets["presence"])
+    kind = _binary_loss(prediction.road_edge, targets["road_edge"])
+    # Unknown horizons are NaN, also for the gradient if they took part in the difference.
+    is_known = targets["horizon"].isfinite()
+    horizon = ((prediction.horizon - targets["horizon"].nan_to_num()).abs() * is_known).mean()
+    return 30.0 * lateral + 0.1 * deviation + 0.3 * presence + 0.15 * kind + 5.0 * horizon
+
+
+def _binary_loss(logits: Tensor, truth: Tensor) -> Tensor:
+    """Returns the mean cross entropy of logits where the truth, 0 or 1, is known; it is -1 where it is not."""
+    known = (truth >= 0.0).float()
+    total = functional.binary_cross_entropy_with_logits(logits, truth.clamp(min=0.0), weight=known, reduction="sum")
+    return total / known.sum().clamp(min=1.0)

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lanestream.errors import SourceError
 from lanestream_exporter.scenes import Drive, sample_clip, write_clip
 from lanestream_exporter.scenes.clip import ProgressCallback
+from lanestream_exporter.scenes.scene import STYLES
 from lanestream_exporter.scenes.tracking_clips import KINDS, sample_tracking_clip
 from lanestream_exporter.scenes.tracking_truth import write_tracking_clip
 
@@ -54,7 +55,7 @@ class SizeType(click.ParamType[tuple[int, int]]):
 @click.option("--size", default="1280x720", show_default=True, type=SizeType())
 @click.option(
     "--style",
-    type=click.Choice(["highway", "country", "street", "lane"]),
+    type=click.Choice(list(STYLES)),
     help="Road of an ordinary drive.  [default: highway]",
 )
 @click.option("--any-weather", is_flag=True, help="Sample night, rain, fog and camera faults too, not only clear days.")

@@ -15,15 +15,22 @@ from lanestream_exporter.datasets.manifest import origin_of
 from lanestream_exporter.samples.patch_files import PatchCache
 from lanestream_exporter.toml_files import CONFIG_FOLDER
 from lanestream_exporter.training.classifier import ClassifierTask, starting_network
-from lanestream_exporter.training.config import ClassifierConfig, RegressorConfig, TrainConfig, read_config
+from lanestream_exporter.training.config import C, ClassifierConfig, RegressorConfig, TrainConfig, read_config
 from lanestream_exporter.training.data_sources import frame_sources, open_datasets, patch_files
 from lanestream_exporter.training.loop import Run, Task, TrainingProgress, best_device, describe_device
 from lanestream_exporter.training.regressor import RegressorTask, starting_regressor
+from lanestream_exporter.training.shipped import write_half
 
 _INTERRUPTED = 130
 
 _RUN = click.option(
     "--run", "folder", type=click.Path(path_type=Path), required=True, help="Folder of the run; created if missing."
+)
+_INITIAL = click.option(
+    "--initial", metavar="FILE", help="Start from this checkpoint, or from `shipped`, instead of the recipe's."
+)
+_MANIFEST = click.option(
+    "--manifest", metavar="FILE", help="Train on the data sets of this manifest instead of the recipe's."
 )
 _DATA = click.option(
     "--data",
@@ -41,20 +48,21 @@ def train() -> None:
 @train.command()
 @click.argument("config", type=click.Path(path_type=Path), default=Path("classifier"))
 @_RUN
+@_INITIAL
+@_MANIFEST
 @_DATA
 @click.option("--patches", type=click.Path(path_type=Path), help="Folder for the patches.  [default: in the run]")
-def classifier(config: Path, folder: Path, data: Path | None, patches: Path | None) -> None:
+def classifier(
+    config: Path, folder: Path, initial: str | None, manifest: str | None, data: Path | None, patches: Path | None
+) -> None:
     """Train the candidate classifier by the recipe CONFIG: a TOML file, or the name of a shipped one.
 
     Renders scenes, cuts patches from them and from real frames, and mixes the two.
     """
-    settings = read_config(config, ClassifierConfig)
+    settings = _changed(read_config(config, ClassifierConfig), initial, manifest)
     network = starting_network(settings)  # before the patches, so that a bad checkpoint is reported early
     datasets = open_datasets(settings.data, data)
-    regressor_file = settings.data.regressor
-    cache = PatchCache(
-        patches or folder / "patches", settings.network.size, Path(regressor_file) if regressor_file else None
-    )
+    cache = PatchCache(patches or folder / "patches", settings.network.size, settings.data.regressor_file)
     with _bar("rendering") as advance:
         files = patch_files(settings.data, datasets, cache, advance)
     sources = [part.read() for part in files]
@@ -67,14 +75,18 @@ def classifier(config: Path, folder: Path, data: Path | None, patches: Path | No
 @train.command()
 @click.argument("config", type=click.Path(path_type=Path), default=Path("regressor"))
 @_RUN
+@_INITIAL
+@_MANIFEST
 @_DATA
 @click.option("--frames", type=click.Path(path_type=Path), help="Folder for the scenes.  [default: in the run]")
-def regressor(config: Path, folder: Path, data: Path | None, frames: Path | None) -> None:
+def regressor(
+    config: Path, folder: Path, initial: str | None, manifest: str | None, data: Path | None, frames: Path | None
+) -> None:
     """Train the regressor by the recipe CONFIG: a TOML file, or the name of a shipped one.
 
     Renders scenes, and warps them and real frames as other cameras and roads would show them.
     """
-    settings = read_config(config, RegressorConfig)
+    settings = _changed(read_config(config, RegressorConfig), initial, manifest)
     network = starting_regressor(settings)
     datasets = open_datasets(settings.data, data)
     with _bar("rendering") as advance:
@@ -86,10 +98,29 @@ def regressor(config: Path, folder: Path, data: Path | None, frames: Path | None
 
 
 @train.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+def checkpoint(source: Path, out: Path) -> None:
+    """Write the checkpoint SOURCE of a run to OUT in half precision, as a small file for others to start from."""
+    write_half(source, out)
+    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+
+
+@train.command()
 @click.argument("name", type=click.Choice(sorted(path.stem for path in CONFIG_FOLDER.glob("*.toml"))))
 def recipe(name: str) -> None:
     """Print the shipped recipe NAME, or the manifest `datasets`, as a starting point for your own."""
     click.echo((CONFIG_FOLDER / f"{name}.toml").read_text(encoding="utf-8"), nl=False)
+
+
+def _changed(config: C, initial: str | None, manifest: str | None) -> C:
+    """Returns the recipe with other initial weights and another manifest, unless they are None."""
+    given = config.model_dump(exclude_unset=True)
+    if initial is not None:
+        given["initial"] = initial
+    if manifest is not None:
+        given.setdefault("data", {})["manifest"] = manifest
+    return type(config).model_validate(given)
 
 
 def _train(task: Task, config: TrainConfig, folder: Path) -> None:

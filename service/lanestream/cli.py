@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from lanestream import __version__
-from lanestream.errors import LanestreamError, needs_extra
+from lanestream.errors import CameraLostError, LanestreamError, needs_extra, needs_whole_packages
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES
 from lanestream.keys import new_key
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 # Exit codes; the last two are 128 plus the number of the signal, as shells report it.
 _EXIT_FAILED: Final = 1
+_EXIT_CAMERA_LOST: Final = 3
 _EXIT_INTERRUPTED: Final = 130
 _EXIT_TERMINATED: Final = 143
 
@@ -158,7 +159,8 @@ def main() -> None:
     if os.getpid() == 1:
         signal.signal(signal.SIGTERM, _terminate)
     try:
-        code = cli.main(standalone_mode=False)
+        with needs_whole_packages():
+            code = cli.main(standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader of the output has closed it; the interpreter must not try to flush the rest at exit.
@@ -166,7 +168,7 @@ def main() -> None:
         code = _EXIT_FAILED
     except LanestreamError as error:
         click.echo(f"error: {error}", err=True)
-        code = _EXIT_FAILED
+        code = _EXIT_CAMERA_LOST if isinstance(error, CameraLostError) else _EXIT_FAILED
     except click.ClickException as error:
         error.show()
         code = error.exit_code

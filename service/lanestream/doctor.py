@@ -8,7 +8,6 @@ import statistics
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,9 +26,10 @@ from lanestream.inference.loaded_model import LoadedModel
 from lanestream.inference.loading import load_model
 from lanestream.inference.model_info import RegressorInfo
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES, PROVIDERS, Installed
+from lanestream.packages import installed_versions, owner_versions, package_conflicts
 from lanestream.settings import Settings, load_settings
 
-_PACKAGES: Final = ("onnxruntime", "onnxruntime-gpu", "openvino", "numpy", "opencv-python-headless")
+_PACKAGES: Final = ("openvino", "numpy")
 # The batch sizes to time, as far as they are among a model's batch sizes.
 _BATCH_SIZES: Final = (1, 2, 4, 8, 12, 16, 32, 64)
 _RUNS_PER_BATCH_SIZE: Final = 9
@@ -64,11 +64,13 @@ class NetworkReport:
 class Diagnosis:
     """Everything that `doctor` reports. `problem` is one line, or None if nothing is wrong.
 
-    `software` maps installed packages to their versions. `installed` lists the providers that are built in; whether
-    one works shows in `networks`. `asked` is the provider that the networks were asked to run on.
+    `software` maps installed packages to their versions; `conflicts` are lines about those that overwrite each other.
+    `installed` lists the providers that are built in; whether one works shows in `networks`. `asked` is the provider
+    that the networks were asked to run on.
     """
 
     software: Mapping[str, str]
+    conflicts: tuple[str, ...]
     cpu: Cpu
     gpu: Gpu
     installed: tuple[str, ...]
@@ -129,14 +131,30 @@ def diagnose(settings: Settings, required: str | None = None) -> Diagnosis:
     if elsewhere and problem is None:
         network = elsewhere[0]
         problem = f"{network.name} runs on {network.provider}, not on {required}: {network.reason}"
-    return Diagnosis(_software(), cpu(), gpu(), _installed_providers(), provider, tuple(networks), problem)
+    return Diagnosis(
+        software=_software(),
+        conflicts=package_conflicts(),
+        cpu=cpu(),
+        gpu=gpu(),
+        installed=_installed_providers(),
+        asked=provider,
+        networks=tuple(networks),
+        problem=problem,
+    )
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> Iterator[Table]:
     """Yields the diagnosis as tables for a terminal."""
     software = ", ".join(f"{name} {version}" for name, version in diagnosis.software.items())
     installed = f"{', '.join(diagnosis.installed)}; requested: {diagnosis.asked}"
-    machine = [("software", software), *_cpu_rows(diagnosis.cpu), *_gpu_rows(diagnosis.gpu), ("providers", installed)]
+    conflicts = [("conflict", conflict) for conflict in diagnosis.conflicts]
+    machine = [
+        ("software", software),
+        *conflicts,
+        *_cpu_rows(diagnosis.cpu),
+        *_gpu_rows(diagnosis.gpu),
+        ("providers", installed),
+    ]
     yield _table("machine", machine)
     for network in diagnosis.networks:
         yield _table(network.kind, _network_rows(network))
@@ -188,12 +206,7 @@ def _median_run_ms(network: LoadedModel, batch_size: int) -> float:
 
 def _software() -> Mapping[str, str]:
     versions = {"lanestream": __version__, "python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return versions
+    return {**versions, **owner_versions("onnxruntime"), **installed_versions(_PACKAGES), **owner_versions("cv2")}
 
 
 def _installed_providers() -> tuple[str, ...]:

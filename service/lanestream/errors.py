@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
+from lanestream.packages import broken_module
+
 
 class LanestreamError(Exception):
     """The root of all errors that Lanestream raises on purpose.
@@ -173,6 +175,12 @@ class SourceError(LanestreamError):
     code = "bad_source"
 
 
+class CameraLostError(SourceError):
+    """A live camera was lost and did not come back in time."""
+
+    code = "camera_lost"
+
+
 class ConnectionFailedError(LanestreamError):
     """The client can't reach the service, or lost the connection."""
 
@@ -261,14 +269,33 @@ def one_line(text: object, max_chars: int = 200) -> str:
 
 @contextmanager
 def needs_extra(extra: str) -> Iterator[None]:
-    """Raises MissingExtraError, which names the packages to install, if an import in the block fails."""
+    """Raises MissingExtraError, which says what to install, if an import in the block fails."""
     try:
-        yield
+        with needs_whole_packages():
+            yield
     except ModuleNotFoundError as error:
         raise MissingExtraError(
             f"this needs the package {error.name}, which is not installed",
             f"pip install 'lanestream[{extra}]'",
         ) from None
+
+
+@contextmanager
+def needs_whole_packages() -> Iterator[None]:
+    """Raises MissingExtraError if the block fails because an installed package can't be used.
+
+    A library of the system may be missing, or another package that owns the same module overwrote or removed it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError:
+        raise
+    except (ImportError, AttributeError) as error:
+        broken = broken_module(error)
+        if broken is None:
+            raise
+        module, repair = broken
+        raise MissingExtraError(f"the package {module} can't be used: {one_line(error)}", repair) from None
 
 
 def _subclasses(root: type[LanestreamError]) -> Iterator[type[LanestreamError]]:

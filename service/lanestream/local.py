@@ -15,11 +15,13 @@ from lanestream.session import SessionOptions
 from lanestream.tracking.departure import VehicleMotion
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from lanestream.engine import Engine
     from lanestream.inference.loaded_model import LoadedModel
     from lanestream.protocol import CameraModel, DepartureOptions, Indicator, LanesMessage, WarningMessage
+    from lanestream.road.appearance import BoundaryKind
     from lanestream.road.curve import FloatArray
     from lanestream.road.view import Image
     from lanestream.session import Session
@@ -53,14 +55,17 @@ class LocalEngine:
         camera: CameraModel | None = None,
         departure: DepartureOptions | None = None,
         *,
+        kinds: Sequence[BoundaryKind] | None = None,
         single_image: bool = False,
     ) -> LocalCamera:
         """Returns one camera's session; `horizon` is a share of the image height, estimated if None.
 
         With a `camera` lanes are reported in meters too, and departures as `departure` says. Raises NoDetectorError if
-        `detector` is not loaded. With `single_image`, only one frame will follow.
+        `detector` is not loaded. `kinds` are those of the boundaries to report, by default all. With `single_image`,
+        only one frame will follow.
         """
-        options = replace(SessionOptions.of(horizon, detector, camera, departure), single_image=single_image)
+        options = SessionOptions.of(horizon, detector, camera, departure, kinds=kinds)
+        options = replace(options, single_image=single_image)
         return LocalCamera(self._engine, self._engine.open_session(options))
 
 

@@ -18,10 +18,12 @@ from lanestream.protocol import (
     LaneModel,
     LanesMessage,
     LineModel,
+    MarkingModel,
     Point,
     SceneCutModel,
     TimingModel,
 )
+from lanestream.road.appearance import MARKING_COLORS, MARKING_TYPES
 from lanestream.road.curve import Curves
 from lanestream.road.results import CalibrationChanged, DepartureEvent, EgoMeters, LaneChange, SceneCut
 
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lanestream.images.decoding import DecodedImage
+    from lanestream.road.appearance import Appearance
     from lanestream.road.curve import FloatArray
     from lanestream.road.results import Calibration, Departure, EgoLane, Estimate, Event, FrameResult, LaneBoundary
 
@@ -39,6 +42,7 @@ _COEFFICIENT_DECIMALS: Final = (4, 7, 4)
 # Decimals that keep a point on the road exact to a millimeter at a distance of a hundred meters.
 _GROUND_DECIMALS: Final = (8, 6, 4)
 
+_PROBABILITY_DECIMALS: Final = 4
 _TIME_DECIMALS: Final = 6
 _DEGREE_DECIMALS: Final = 3
 
@@ -77,11 +81,15 @@ def lanes_message(frame: ProcessedFrame, *, seq: int, timestamp: float, dropped:
 
 
 def _lane(lane: LaneBoundary, points: list[Point]) -> LaneModel:
+    road_edge = lane.appearance.road_edge
     return LaneModel(
         track_id=lane.track_id,
         position=lane.position,
         state=lane.state,
-        probability=round(lane.probability, 4),
+        probability=round(lane.probability, _PROBABILITY_DECIMALS),
+        kind=lane.appearance.kind,
+        kind_probability=round(max(road_edge, 1.0 - road_edge), _PROBABILITY_DECIMALS),
+        marking=_marking(lane.appearance),
         points=points,
         line=LineModel(bottom=points[0], top=points[-1]),
         horizon=round(lane.curve.horizon, _HORIZON_DECIMALS),
@@ -90,6 +98,20 @@ def _lane(lane: LaneBoundary, points: list[Point]) -> LaneModel:
         age_s=round(lane.age_s, 3),
         ground=None if lane.ground is None else _rounded(lane.ground, _GROUND_DECIMALS),
         ground_covariance=None if lane.ground_covariance is None else _significant(lane.ground_covariance),
+    )
+
+
+def _marking(appearance: Appearance) -> MarkingModel | None:
+    """Returns the most probable type and color; None of a road edge, or if they are not classified."""
+    if appearance.kind == "road_edge" or appearance.types is None or appearance.colors is None:
+        return None
+    of_type, of_color = max(appearance.types), max(appearance.colors)
+    return MarkingModel(
+        type=MARKING_TYPES[appearance.types.index(of_type)],
+        type_probability=round(of_type, _PROBABILITY_DECIMALS),
+        color=MARKING_COLORS[appearance.colors.index(of_color)],
+        color_probability=round(of_color, _PROBABILITY_DECIMALS),
+        probability=round(of_type * of_color, _PROBABILITY_DECIMALS),
     )
 
 
@@ -118,6 +140,8 @@ def _ego(ego: EgoLane) -> EgoModel:
     return EgoModel(
         left=ego.left,
         right=ego.right,
+        left_kind=ego.left_kind,
+        right_kind=ego.right_kind,
         **_estimate("offset", ego.offset, 4),
         **_estimate("offset_m", meters.offset, 3),
         **_estimate("lane_width_m", meters.lane_width, 3),

@@ -33,11 +33,18 @@ Point = tuple[float, float]
 Mode = Literal["latest", "all"]
 SessionName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 DetectorName = Literal["candidates", "regression"]
+BoundaryKind = Literal["marking", "road_edge"]
+Kinds = Annotated[tuple[BoundaryKind, ...], Field(min_length=1)]
+MarkingType = Literal["solid", "dashed", "double", "dots"]
+MarkingColor = Literal["white", "yellow"]
 Side = Literal["left", "right"]
 Indicator = Literal["off", "left", "right"]
 WarningCode = Literal["timestamps_in_milliseconds", "timestamps_not_advancing"]
 CameraHeight = Annotated[float, Field(ge=0.3, le=4.0, description="Height of the camera above the road in meters.")]
 FieldOfView = Annotated[float, Field(ge=20.0, le=150.0, description="Horizontal field of view in degrees.")]
+# A camera that looks down has its horizon above the image, up to this fraction of the height.
+HIGHEST_HORIZON: Final = -0.6
+Horizon = Annotated[float, Field(ge=HIGHEST_HORIZON, lt=1.0)]
 Auto = Literal["auto"]
 FocalLength = Annotated[float, Field(ge=10.0, le=1e5)]
 ImageSide = Annotated[int, Field(ge=64, le=1 << 16)]
@@ -145,12 +152,19 @@ class StartMessage(Message):
     detector: DetectorName | None = Field(
         default=None, description="The detector that finds the lanes; the service's default if missing."
     )
-    horizon: Annotated[float, Field(gt=0.0, lt=1.0)] | None = Field(
-        default=None, description="Row of the horizon as a fraction of the image height; estimated if missing."
+    horizon: Horizon | None = Field(
+        default=None,
+        description="Row of the horizon as a fraction of the image height, negative above the image; estimated if "
+        "missing.",
     )
     camera: CameraModel | None = Field(default=None, description="If present, lanes are also reported in meters.")
     departure: DepartureOptions | None = Field(
         default=None, description="When to warn of lane departures; the service's settings if missing."
+    )
+    kinds: Kinds | None = Field(
+        default=None,
+        description="The kinds of boundaries to report: `marking`, `road_edge` or both; the service's setting if "
+        "missing.",
     )
 
 
@@ -218,6 +232,16 @@ class LineModel(Message):
     top: Point
 
 
+class MarkingModel(Message):
+    """How a marking is painted, as all frames in which it was detected have shown so far."""
+
+    type: MarkingType = Field(description="The most probable type; `dots` are raised dots.")
+    type_probability: float
+    color: MarkingColor = Field(description="The more probable color.")
+    color_probability: float
+    probability: float = Field(description="Probability that type and color are both right.")
+
+
 class LaneModel(Message):
     """A tracked lane boundary: x(y) = v + b u + k / u with u = y - horizon and `coefficients` [v, b, k].
 
@@ -231,6 +255,13 @@ class LaneModel(Message):
         " `predicted` only."
     )
     probability: float
+    kind: BoundaryKind = Field(
+        default="marking", description="A `marking` on the road, or a `road_edge`: a curb, or where the pavement ends."
+    )
+    kind_probability: float = Field(default=1.0, description="Probability that it is of this kind.")
+    marking: MarkingModel | None = Field(
+        default=None, description="Null for a road edge, and if the model does not classify markings."
+    )
     points: list[Point] = Field(description="Points on the curve, from the lowest row to the highest.")
     line: LineModel
     horizon: float
@@ -255,7 +286,7 @@ class LaneModel(Message):
 
 
 class EgoModel(Message):
-    """The lane the camera is in: the track ids of its boundaries, and the camera's offset from the center.
+    """The lane the camera is in: the track ids and kinds of its boundaries, and the camera's offset from the center.
 
     `offset` is a fraction of the lane width, positive to the right; null unless both boundaries are known. The fields
     in meters need a camera model and apply at the vehicle's middle: `offset_m` and `lane_width_m` if both boundaries
@@ -264,6 +295,8 @@ class EgoModel(Message):
 
     left: int | None
     right: int | None
+    left_kind: BoundaryKind | None = Field(default=None, description="Kind of the left boundary; null without one.")
+    right_kind: BoundaryKind | None = Field(default=None, description="Kind of the right boundary; null without one.")
     offset: float | None
     offset_sigma: float | None = None
     offset_m: float | None = Field(default=None, description="Offset in meters, positive to the right of the center.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -10,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.interface import Detections, Detector, FrameContext, Infer, ModelRole
-from lanestream.errors import ProtocolError
+from lanestream.errors import ProtocolError, one_line
 from lanestream.images.resizing import working_image
 from lanestream.images.scene_cut import SceneMemory
 from lanestream.protocol import CameraModel, DepartureOptions
+from lanestream.road.appearance import BOUNDARY_KINDS, BoundaryKind
 from lanestream.road.camera import Camera, Lens
 from lanestream.road.curve import FloatArray
 from lanestream.road.ground import with_meters
@@ -33,9 +35,10 @@ from lanestream.tracking.tracker import LaneTracker
 # The least weight of a new frame's horizon: bumps should not move the estimate, a minute of driving should.
 _HORIZON_GAIN: Final = 0.1
 # The limits of a saved state: a side of a working image in pixels, and the row of a horizon as a share of the height.
-# Detectors place no horizon lower, because some road must be visible below it.
+# Detectors place no horizon lower, because some road must be visible below it, and none higher: cameras that look down
+# have theirs up to the height of an image above it, and wide images are low.
 _LONGEST_SIDE: Final = 1 << 20
-_HORIZONS: Final = (-1.0, 0.98)
+_HORIZONS: Final = (-2.0, 0.98)
 # How exactly the lowest row of a road filter is that of the images, in pixels.
 _ROUNDING: Final = 1e-3
 
@@ -44,10 +47,10 @@ _ROUNDING: Final = 1e-3
 class SessionOptions:
     """What the caller of a session chooses.
 
-    `horizon` is its row as a share of the image height; if None, it is estimated. `detector` is the name of the
-    detector, by default the service's. With a `camera`, results are also in meters, and departures are warned of as
-    `departure` says. With `single_image`, every boundary of the first frame is reported: no other frame will follow
-    that could confirm it.
+    `horizon` is its row as a share of the image height, negative above the image; if None, it is estimated. `detector`
+    is the name of the detector, by default the service's. With a `camera`, results are also in meters, and departures
+    are warned of as `departure` says. With `single_image`, every boundary of the first frame is reported: no other
+    frame will follow that could confirm it. Only boundaries of the `kinds` are reported.
     """
 
     horizon: float | None = None
@@ -55,6 +58,7 @@ class SessionOptions:
     camera: Camera | None = None
     departure: DepartureSettings = DepartureSettings()
     single_image: bool = False
+    kinds: tuple[BoundaryKind, ...] = BOUNDARY_KINDS
 
     @classmethod
     def of(
@@ -64,16 +68,26 @@ class SessionOptions:
         camera: CameraModel | None,
         departure: DepartureOptions | None = None,
         defaults: DepartureSettings | None = None,
+        kinds: Sequence[BoundaryKind] | None = None,
     ) -> SessionOptions:
-        """Returns the options that a client sends; `defaults` are those of `departure`.
+        """Returns the options that a client sends; `defaults` are those of `departure`. `kinds` defaults to all.
 
-        Raises ProtocolError if two of them contradict each other.
+        Raises ProtocolError if two of them contradict each other, or if no kind or an unknown one is given.
         """
         if horizon is not None and camera is not None and isinstance(camera.pitch, float):
             raise ProtocolError("the horizon and the camera's pitch are both given", "give one; each implies the other")
+        if kinds is not None and (not kinds or not set(kinds) <= set(BOUNDARY_KINDS)):
+            given = one_line(", ".join(kinds), 80) or "none"
+            raise ProtocolError(f"the kinds of boundaries to report are {given}", "give marking, road_edge or both")
         known = None if camera is None else Camera(**camera.model_dump())
         chosen = {} if departure is None else departure.model_dump(exclude_none=True)
-        return cls(horizon, detector, known, replace(defaults or DepartureSettings(), **chosen))
+        return cls(
+            horizon,
+            detector,
+            known,
+            replace(defaults or DepartureSettings(), **chosen),
+            kinds=BOUNDARY_KINDS if kinds is None else tuple(kinds),
+        )
 
 
 DEFAULT_SESSION: Final = SessionOptions()
@@ -129,8 +143,8 @@ class Session:
         self._horizon: float | None = None
         self._prior_horizon: float | None = None
         self._evidence = 0.0
-        self._single_image = options.single_image
-        self._tracker = LaneTracker(options.single_image)
+        self._single_image, self._kinds = options.single_image, options.kinds
+        self._tracker = LaneTracker(options.single_image, options.kinds)
         self._scene = SceneMemory()
         self._departure = DepartureMonitor(options.departure)
 
@@ -159,7 +173,7 @@ class Session:
         Raises ValueError for an incomplete state, and leaves the session as it was. A state from outside this process
         needs `SessionState.validate` first, which takes too long for every frame.
         """
-        self._tracker = LaneTracker.restored(state.tracker, ids_lost, self._single_image)
+        self._tracker = LaneTracker.restored(state.tracker, ids_lost, self._single_image, self._kinds)
         self._size, self._horizon, self._evidence = state.size, state.horizon, state.evidence
         self._prior_horizon = state.prior_horizon
         self._departure.state = state.departure
@@ -221,13 +235,15 @@ class Session:
     def _context(self, image: Image, working: Image, scaling: Scaling, lens: Lens | None, is_cut: bool) -> FrameContext:
         height, width = working.shape[:2]
         is_known = self._size == (width, height) and not is_cut
-        horizon = None if self._horizon is None or is_cut else self._horizon * height
+        given: float | None = None
         if self._configured is not None:
-            horizon = scaling.to_working(self._configured * image.shape[0])
+            given = scaling.to_working(self._configured * image.shape[0])
         elif self._camera is not None and lens is not None and self._camera.fixed_pitch is not None:
-            horizon = self._camera.horizon(lens, height)
+            given = self._camera.horizon(lens, height)
+        estimated = None if self._horizon is None or is_cut else self._horizon * height
         return FrameContext(
-            horizon=horizon,
+            horizon=estimated if given is None else given,
+            is_given=given is not None,
             tracked=self._tracker.curves if is_known else None,
             prior_horizon=None if self._prior_horizon is None or not is_known else self._prior_horizon * height,
         )
@@ -237,7 +253,7 @@ class Session:
         view = detections.view
         size = view.width, view.height
         if self._size not in (None, size):
-            self._tracker = LaneTracker(self._single_image)
+            self._tracker = LaneTracker(self._single_image, self._kinds)
             self._departure.state = DepartureState()
         if self._size not in (None, size) or is_cut:
             self._horizon, self._evidence = None, 0.0

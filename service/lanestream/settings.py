@@ -26,6 +26,7 @@ from lanestream.host import memory, network_threads, processors
 from lanestream.images.decoding import MOST_PIXELS, ImageLimits
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES, RuntimeOptions
 from lanestream.keys import ApiKey, parse_keys
+from lanestream.road.appearance import BOUNDARY_KINDS, BoundaryKind
 from lanestream.streaming.session_registry import SessionLimits
 from lanestream.streaming.stream_protocol import StreamLimits
 from lanestream.tracking.departure import DepartureSettings
@@ -61,6 +62,11 @@ def _origins(value: object) -> object:
         if not _ORIGIN.fullmatch(origin):
             raise ValueError(f"{origin!r} is not a valid origin; expected scheme://host or scheme://host:port")
     return tuple(_without_default_port(origin) for origin in origins)
+
+
+def _names(value: object) -> object:
+    """Returns the names in a string, separated by commas or lines, or in a list of such strings."""
+    return tuple(name for name in _split(value) if name)
 
 
 def _without_default_port(origin: str) -> str:
@@ -193,6 +199,11 @@ class Settings(BaseSettings):
     )
     opencv_threads: int = Field(default=1, ge=1, le=256, description="Threads that OpenCV uses for one image.")
 
+    kinds: Annotated[tuple[BoundaryKind, ...], NoDecode, BeforeValidator(_names)] = Field(
+        default=BOUNDARY_KINDS,
+        min_length=1,
+        description="The kinds of boundaries to report, `marking`, `road_edge` or both, if a request does not say it.",
+    )
     camera: Path | None = Field(
         default=None, description="Camera file for streams and images that send no camera; without it, none is assumed."
     )

@@ -16,3 +16,12 @@ def test_the_real_labels_are_sound(data: Path) -> None:
     assert clip.faults == []
     assert clip.contents.groups == {"highway_concrete": 12}
     assert clip.contents.sizes == {(1280, 720): 12}
+    for name, frames, types in (
+        ("brazil_dnit", 1089, {"solid", "dashed", "double"}),
+        ("lums_campus", 145, {"kerb", "edge"}),
+        ("moscow_city", 92, {"solid", "dashed", "double", "kerb", "edge"}),
+    ):
+        wider = check_dataset(data / name)
+        assert wider.faults == []
+        assert sum(wider.contents.groups.values()) == frames
+        assert types <= set(wider.contents.types)

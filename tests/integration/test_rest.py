@@ -105,14 +105,15 @@ def test_a_body_of_unknown_length_is_not_read_beyond_the_limit(url: str) -> None
         assert problem(detect(url, endless())) == (413, "image_too_large")
 
 
-@pytest.mark.parametrize("horizon", ["0", "1", "-0.1", "nan", "x"])
-def test_a_horizon_outside_the_image_is_refused(url: str, horizon: str) -> None:
+@pytest.mark.parametrize("horizon", ["1", "-0.61", "nan", "x"])
+def test_a_horizon_outside_its_range_is_refused(url: str, horizon: str) -> None:
     assert problem(detect(url, fakes.image_file(), params={"horizon": horizon})) == (422, "bad_message")
 
 
-def test_a_horizon_is_used(url: str) -> None:
-    response = detect(url, fakes.image_file(), params={"horizon": "0.25"})
-    assert response.json()["horizon"] == pytest.approx(45.0, abs=0.5), "half a pixel of a resized image"
+@pytest.mark.parametrize("share", [0.25, 0.0, -0.2, -0.6])
+def test_a_horizon_is_used(url: str, share: float) -> None:
+    response = detect(url, fakes.image_file(), params={"horizon": str(share)})
+    assert response.json()["horizon"] == pytest.approx(180.0 * share, abs=0.5), "half a pixel of a resized image"
 
 
 @pytest.mark.parametrize(("query", "positions"), [("", [-1, 1]), ("candidates", [-1, 1]), ("regression", [-1])])
@@ -128,6 +129,34 @@ def test_a_detector_that_is_not_loaded_is_refused(url: str) -> None:
     unknown = detect(url, fakes.image_file(), params={"detector": "guesses"})
     assert problem(unknown) == (422, "bad_message")
     assert "'candidates' or 'regression'" in unknown.json()["message"]
+
+
+@pytest.mark.parametrize(
+    ("query", "name"),
+    [
+        ("horizn=0.3", "'horizn'"),
+        ("Horizon=0.3", "'Horizon'"),
+        ("horizon=0.3&kind=marking", "'kind'"),
+        ("camera_height=1.4&fov=60", "'fov'"),
+        ("=1", "''"),
+        ("kinds[]=marking", "'kinds[]'"),
+        ("a%0Ab=1", r"'a\nb'"),
+        (300 * "x" + "=1", "'" + 79 * "x"),
+    ],
+)
+def test_an_unknown_query_field_is_refused(url: str, query: str, name: str) -> None:
+    response = httpx.post(f"{url}/v1/detect?{query}", content=fakes.image_file())
+    assert problem(response) == (422, "bad_message")
+    assert response.json()["message"] == f"unknown query field {name}"
+    hint = "camera_height, field_of_view, camera, horizon, detector, kinds are accepted"
+    assert sorted(response.json()["hint"].replace(" ", ",").split(",")) == sorted(hint.replace(" ", ",").split(","))
+
+
+def test_a_request_without_query_fields_accepts_none(url: str) -> None:
+    response = httpx.get(f"{url}/v1/models?detector=candidates")
+    assert (response.status_code, response.json()["hint"]) == (422, "none is accepted here")
+    assert httpx.get(f"{url}/v1/models").status_code == 200
+    assert httpx.get(f"{url}/healthz?from=balancer").status_code == 200
 
 
 def test_unexpected_errors_reveal_no_details(url: str) -> None:

@@ -196,6 +196,7 @@ BAD_TEXTS = [
     '{"type": "stop"}',
     '{"type": "start", "mode": "some"}',
     '{"type": "start", "horizon": 1.5}',
+    '{"type": "start", "horizon": -0.61}',
     '{"type": "start", "detector": "guesses"}',
     '{"type": "start", "speed": 1}',
     '{"type": "frame", "seq": -1}',

@@ -49,7 +49,7 @@ starts = st.fixed_dictionaries(
         "session": st.sampled_from(["front", "a.b-c_1"]),
         "resume_token": st.text("abc-_", max_size=130),
         "detector": st.sampled_from(["candidates", "regression", None]),
-        "horizon": st.floats(0.01, 0.99),
+        "horizon": st.floats(-0.6, 0.99),
         "camera": st.just({"height": 1.4, "field_of_view": 60}),
     },
 )

@@ -20,8 +20,11 @@ class DatasetContents:
     sizes: Counter[tuple[int, int]] = field(default_factory=Counter)
     lanes: Counter[int] = field(default_factory=Counter)
     kinds: Counter[str] = field(default_factory=Counter)
+    types: Counter[str] = field(default_factory=Counter)
     colors: Counter[str] = field(default_factory=Counter)
     positions: Counter[int] = field(default_factory=Counter)
+    splits: Counter[str] = field(default_factory=Counter)
+    converted: Counter[str] = field(default_factory=Counter)
     others: Counter[str] = field(default_factory=Counter)
     rows: tuple[float, float] | None = None
 
@@ -30,7 +33,8 @@ class DatasetContents:
         self.groups[frame.group] += 1
         self.sizes[frame.width, frame.height] += 1
         self.lanes[len(frame.lanes)] += 1
-        self.kinds.update(lane.kind for lane in frame.lanes if lane.kind)
+        self.kinds.update(lane.kind or "unknown" for lane in frame.lanes)
+        self.types.update(lane.type for lane in frame.lanes if lane.type)
         self.colors.update(lane.color for lane in frame.lanes if lane.color)
         self.positions.update(lane.position for lane in frame.lanes if lane.position is not None)
         rows = [float(y) for lane in frame.lanes for y in (lane.points[0, 1], lane.points[-1, 1])]
@@ -42,12 +46,15 @@ class DatasetContents:
         common = ", ".join(f"{name} ({count})" for name, count in self.groups.most_common(5))
         summaries = [
             ("groups", f"{len(self.groups)}: {common}{', ...' if len(self.groups) > 5 else ''}"),
+            ("splits", _counts(self.splits)),
             ("lanes per frame", _counts(self.lanes)),
             ("image sizes", ", ".join(f"{w} x {h}: {count}" for (w, h), count in self.sizes.most_common())),
             ("rows covered", f"{self.rows[0]:g} to {self.rows[1]:g}" if self.rows else "none"),
             ("positions", _counts(self.positions)),
             ("kinds", _counts(self.kinds)),
+            ("types", _counts(self.types)),
             ("colors", _counts(self.colors)),
+            ("converted shapes", _counts(self.converted)),
             ("ignored shapes", _counts(self.others)),
         ]
         return [f"frames: {self.groups.total()}", *(f"{name}: {text}" for name, text in summaries if text)]
@@ -86,7 +93,9 @@ class DatasetCheck:
             self.faults.append(found)
             return
         self.contents.add(found.frame)
+        self.contents.converted.update(found.entry.converted)
         self.contents.others.update(found.entry.others)
+        self.contents.splits.update([found.entry.split] if found.entry.split else [])
         self._find_duplicate(found)
 
     def _find_duplicate(self, sample: LabeledSample) -> None:

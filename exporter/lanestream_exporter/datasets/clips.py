@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, numbered, size_of
+from lanestream_exporter.datasets.entries import (
+    UNKNOWN,
+    FieldValue,
+    LabeledLook,
+    LabelEntries,
+    LabelEntry,
+    is_type,
+    numbered,
+    size_of,
+)
 from lanestream_exporter.datasets.files import (
     DataFolder,
     drive_of,
@@ -16,19 +27,19 @@ from lanestream_exporter.datasets.files import (
     path_in_labels,
     read_json_lines,
     scan_json_lines,
+    start_of,
 )
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import PARTIAL, Coverage, LabeledFrame, LabeledLane, points_of
+from lanestream_exporter.datasets.labels import LANE_TYPES, PARTIAL, Coverage, LabeledFrame, LabeledLane, points_of
 
 _NEEDED: Final = "frame, width, height and lanes"
-# The optional fields of a lane, in the order of LabeledLane's fields.
-_LANE_FIELDS: Final[Mapping[str, type]] = {"id": int, "position": int, "type": str, "color": str}
 
 
 def is_clip_labels(path: Path, start: bytes) -> bool:
     """Whether the file at `path` holds clip labels, by its first bytes."""
-    has_lanes = b'"lanes"' in start and (b'"frame"' in start or b'"image"' in start)
-    return path.suffix.lower() in (".json", ".jsonl") and has_lanes
+    # As keys: other programs may have labels of these names.
+    has_lanes, has_image = (re.search(rb'"(%s)"\s*:' % keys, start) is not None for keys in (b"lanes", b"frame|image"))
+    return path.suffix.lower() in (".json", ".jsonl") and has_lanes and has_image
 
 
 def clip_entries(folder: DataFolder) -> LabelEntries:
@@ -36,7 +47,10 @@ def clip_entries(folder: DataFolder) -> LabelEntries:
 
     A group is a clip. Its video is looked for next to the labels and in the folders `clips` and `videos`.
     """
-    for path in folder.with_suffix(".jsonl"):
+    for path in folder.with_suffix(".jsonl", ".json"):
+        # A folder may hold JSON files of another kind, such as a camera's calibration.
+        if path.suffix.lower() == ".json" and not is_clip_labels(path, start_of(path)):
+            continue
         # In order, because a video is decoded from its start.
         yield from sorted(_file_entries(path, folder), key=_video_index)
 
@@ -68,7 +82,7 @@ def _file_entries(path: Path, folder: DataFolder) -> LabelEntries:
             yield record
             continue
         try:
-            yield _entry(record, location, path, folder)
+            yield replace(_entry(record, location, path, folder), fields=_fields(record))
         except (ValueError, KeyError, TypeError, OverflowError, AttributeError) as error:
             yield field_error(location, error, _NEEDED)
         except LabelError as error:
@@ -82,13 +96,13 @@ def _video_index(found: LabelEntry | LabelError) -> int:
 def _entry(record: dict[str, Any], location: str, path: Path, folder: DataFolder) -> LabelEntry:
     size = size_of(record["width"], record["height"])
     lanes = numbered(_lanes(record))
-    clip = path_in_labels(record.get("clip") or f"{path.stem}.mp4")
+    clip = path_in_labels(record.get("clip") or path.with_suffix("").name)
     split = record.get("split")
     if "image" not in record:
         index = int(record["frame"])
         video = folder.find_video(clip, path)
         source = f"{video.name}#{index}"
-        return LabelEntry(location, source, clip.stem, ImageLocation(video, index), lanes, size, video, index, split)
+        return LabelEntry(location, source, video.stem, ImageLocation(video, index), lanes, size, video, index, split)
     image = folder.find(path.parent / path_in_labels(record["image"]))
     if "clip" not in record or "frame" not in record:
         group = clip.stem if "clip" in record else drive_of(image.parent)
@@ -113,7 +127,20 @@ def _lanes(record: dict[str, Any]) -> Iterator[LabeledLane]:
             points = points_of(lane["points"])
         except ValueError as error:
             raise ValueError(f"lane {number}: {error}") from None
-        yield LabeledLane(points, *(_field(lane, name, kind) for name, kind in _LANE_FIELDS.items()))
+        look = _look(_field(lane, "type", str), _field(lane, "color", str))
+        where = _field(lane, "id", int), _field(lane, "position", int)
+        yield LabeledLane(points, *where, look.type, look.color, look.default_kind)
+
+
+def _look(type_name: str | None, color: str | None) -> LabeledLook:
+    if type_name is not None and not is_type(type_name):
+        accepted = f"accepted are {', '.join(LANE_TYPES)} and {UNKNOWN}"
+        raise ValueError(f"its type {type_name!r} is not known; {accepted}")
+    return LabeledLook.of([type_name] if type_name else [], [color] if color else [])
+
+
+def _fields(record: dict[str, Any]) -> dict[str, FieldValue]:
+    return {name: value for name, value in record.items() if isinstance(value, FieldValue)}
 
 
 def _field(lane: dict[str, Any], name: str, kind: type) -> Any:

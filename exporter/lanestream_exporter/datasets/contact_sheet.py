@@ -8,8 +8,10 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lanestream.errors import SourceError
+from lanestream.road.curve import FloatArray
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabeledFrame
 
@@ -17,6 +19,7 @@ _COLUMNS: Final = 6
 _WIDTH: Final = 320  # pixels of a thumbnail
 _CAPTION: Final = 18  # pixels of height
 _MOST: Final = 60  # thumbnails
+_DOT_DISTANCE: Final = 8.0  # pixels between the dots along an edge of the road
 _SUBPIXEL_BITS: Final = 4
 _SUFFIXES: Final = (".jpg", ".jpeg", ".png")
 
@@ -82,14 +85,30 @@ class ContactSheet:
 
 
 def _tile(frame: LabeledFrame, image: Image) -> Image:
-    """Returns the thumbnail of a frame with its lanes, and its name underneath."""
+    """Returns the thumbnail of a frame with its lanes, edges of the road dotted, and its name underneath."""
     scale = _WIDTH / frame.width
     thumbnail = cv2.resize(image, (_WIDTH, max(1, round(frame.height * scale))), interpolation=cv2.INTER_AREA)
     for number, lane in enumerate(frame.lanes):
         color = _POSITIONS.get(lane.position or 0, _PALETTE[number % len(_PALETTE)])
-        fixed = np.round(((lane.points + 0.5) * scale - 0.5) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        cv2.polylines(thumbnail, [fixed], False, color, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
+        points = (lane.points + 0.5) * scale - 0.5
+        if lane.kind == "road_edge":
+            for dot in _every(_DOT_DISTANCE, points):
+                cv2.circle(thumbnail, _fixed(dot).tolist(), 2 << _SUBPIXEL_BITS, color, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        else:
+            cv2.polylines(thumbnail, [_fixed(points)], False, color, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
     caption = np.zeros((_CAPTION, _WIDTH, 3), np.uint8)
     name = frame.source.encode("ascii", "replace").decode()[-52:]
     cv2.putText(caption, name, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (220, 220, 220), 1, cv2.LINE_AA)
     return np.vstack([thumbnail, caption]).astype(np.uint8, copy=False)
+
+
+def _every(distance: float, points: FloatArray) -> FloatArray:
+    """Returns points (M, 2) at even distances along the polyline `points` (N, 2), about `distance` apart."""
+    lengths = np.concatenate([[0.0], np.hypot(*np.diff(points, axis=0).T).cumsum()])
+    along = np.linspace(0.0, lengths[-1], max(2, round(lengths[-1] / distance) + 1))
+    return np.stack([np.interp(along, lengths, column) for column in points.T], axis=1)
+
+
+def _fixed(points: FloatArray) -> NDArray[np.int32]:
+    """Returns points in OpenCV's fixed-point format."""
+    return np.round(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)

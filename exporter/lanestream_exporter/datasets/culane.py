@@ -10,7 +10,7 @@ from typing import Final
 
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry
-from lanestream_exporter.datasets.files import DataFolder, drive_of, error_at, read_text
+from lanestream_exporter.datasets.files import DataFolder, drive_of, error_at, read_lines
 from lanestream_exporter.datasets.images import ImageLocation
 from lanestream_exporter.datasets.labels import LabeledLane, points_of
 
@@ -43,7 +43,7 @@ def culane_entries(folder: DataFolder) -> LabelEntries:
 def _lanes(path: Path) -> tuple[dict[str, LabeledLane], list[LabelError]]:
     lanes, faults = {}, []
     try:
-        lines = read_text(path, _ACCEPTED).splitlines()
+        lines = read_lines(path, _ACCEPTED)
     except LabelError as error:
         return {}, [error]
     for number, line in enumerate(lines, start=1):

@@ -1,14 +1,16 @@
 """Reads CVAT's labels, "CVAT for images 1.1" and "CVAT for video 1.1". Polylines in the XML file are lane boundaries.
 
-The attributes `type` (or `kind`), `color` (or `colour`), `position` and `id` of a polyline are used; words of its
-label stand in for the first two. A track's id is the boundary's id. Coordinates are taken as written.
+Polygons, points and skeletons are converted as `shapes` explains, and `cvat_frames` finds the images. The attributes
+`type` (or `kind`), `color` (or `colour`), `position` and `id` of a shape are used; words of its label stand in for the
+first two. A track's id is the boundary's id. Coordinates are taken as written.
 Format: docs.cvat.ai/docs/dataset_management/formats/format-cvat and docs.cvat.ai/docs/other/xml_format.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 from xml.etree.ElementTree import Element, ParseError
@@ -17,12 +19,14 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import parse
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, color_in, kind_in, numbered, size_of
-from lanestream_exporter.datasets.files import DataFolder, drive_of, error_at, field_error, path_in_labels
-from lanestream_exporter.datasets.images import ImageLocation
+from lanestream_exporter.datasets.cvat_frames import CvatExport, CvatFrame, frame_number
+from lanestream_exporter.datasets.entries import LabeledLook, LabelEntries, LabelEntry, size_of
+from lanestream_exporter.datasets.files import DataFolder, error_at, field_error
 from lanestream_exporter.datasets.labels import LabeledLane, points_of
+from lanestream_exporter.datasets.shapes import DrawnBoundaries, DrawnShape, may_be_boundary, no_boundaries, words_of
 
-_SHAPES: Final = frozenset({"box", "polygon", "points", "cuboid", "skeleton", "ellipse", "mask"})
+_SHAPES: Final = frozenset({"polyline", "box", "polygon", "points", "cuboid", "skeleton", "ellipse", "mask"})
+_WITH_POINTS: Final = frozenset({"polyline", "polygon", "points", "skeleton"})
 _POSITION: Final = re.compile(r"[+-]?[1-9]")
 _ACCEPTED: Final = "an XML file of CVAT, for images or for video, is accepted"
 
@@ -36,6 +40,7 @@ def cvat_entries(folder: DataFolder) -> LabelEntries:
     """Yields the frames of all XML files.
 
     A group is the folder of the images if their names have one, else the name of the task; of a video task, the video.
+    Frames of a video task without a boundary are left out: CVAT lists those that nobody labeled, too.
     """
     for path in folder.with_suffix(".xml"):
         try:
@@ -43,29 +48,9 @@ def cvat_entries(folder: DataFolder) -> LabelEntries:
         except LabelError as error:
             yield error
             continue
-        for image in root.iterfind("image"):
-            location = f"{path}: image {image.get('name')}"
-            try:
-                yield _image_entry(image, location, _Export(path, root, folder))
-            except (ValueError, KeyError, TypeError, OverflowError) as error:
-                yield field_error(location, error, "name, width and height, and a polyline points")
-            except LabelError as error:
-                yield error_at(location, error)
-        yield from _track_entries(_Export(path, root, folder))
-
-
-@dataclass(frozen=True)
-class _Export:
-    """One XML file in its folder."""
-
-    path: Path
-    root: Element
-    folder: DataFolder
-
-    def text(self, *paths: str) -> str:
-        """Returns the text of the first of the elements at `paths` that has any."""
-        found = (self.root.findtext(path) for path in paths)
-        return next((text.strip() for text in found if text), "")
+        export = CvatExport(path, root, folder)
+        yield from _image_entries(export)
+        yield from _track_entries(export)
 
 
 def _root(path: Path) -> Element:
@@ -82,102 +67,117 @@ def _root(path: Path) -> Element:
     return root
 
 
-def _image_entry(image: Element, location: str, export: _Export) -> LabelEntry:
-    name, base = path_in_labels(image.attrib["name"]), export.path.parent
-    subset = path_in_labels(image.get("subset") or ".")
-    found = export.folder.find(base / "images" / name, base / name, base / "images" / subset / name)
-    lanes: list[LabeledLane] = []
-    others: list[str] = []
-    for shape in image:
-        if shape.tag == "polyline":
-            number = len(lanes) + 1
-            lanes.append(_lane(shape, f"polyline {number}", shape.get("label", ""), None))
-        elif shape.tag in _SHAPES:
-            others.append(shape.tag)
-    task = export.text(f"meta/project/tasks/task[id='{int(image.get('task_id', 0))}']/name", "meta/task/name")
-    group = drive_of(found.parent) if len(name.parts) > 1 or not task else f"task {task}"
+def _image_entries(export: CvatExport) -> LabelEntries:
+    left_out: Counter[str] = Counter()
+    is_empty = True
+    for image in export.root.iterfind("image"):
+        location = f"{export.path}: image {image.get('name')}"
+        try:
+            size, drawn = _drawn_on(image)
+            if frame_number(image.attrib["name"]) is not None and not drawn.lanes:
+                left_out.update(drawn.others)
+                continue
+            task = export.task(int(image.get("task_id", 0)))
+            frame = task.named_frame(image.attrib["name"], image.get("subset") or ".")
+            yield _entry(location, frame, drawn, size)
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
+            yield field_error(location, error, "name, width and height, and a polyline points")
+        except LabelError as error:
+            yield error_at(location, error)
+        is_empty = False
+    if is_empty and left_out:
+        yield no_boundaries(export.path, left_out)
+
+
+def _drawn_on(image: Element) -> tuple[tuple[int, int], DrawnBoundaries]:
+    """Returns the size of an image and the boundaries that were drawn on it."""
     size = size_of(image.attrib["width"], image.attrib["height"])
-    source = export.folder.name(found)
+    counts: Counter[str] = Counter()
+    shapes = []
+    for element in image:
+        if element.tag in _SHAPES:
+            counts[element.tag] += 1
+            shapes.append(_shape(element, f"{element.tag} {counts[element.tag]}", element.get("label", ""), None))
+    return size, DrawnBoundaries.of(shapes, "CVAT", size[0])
+
+
+def _entry(location: str, frame: CvatFrame, drawn: DrawnBoundaries, size: tuple[int, int] | None) -> LabelEntry:
     return LabelEntry(
-        location, source, group, ImageLocation(found), numbered(lanes, "polyline"), size, others=tuple(others)
-    )
+        location, frame.source, frame.group, frame.image, drawn.lanes, size, frame.video, frame.index,
+        converted=drawn.converted, others=drawn.others,
+    )  # fmt: skip
 
 
-def _lane(shape: Element, where: str, label: str, lane_id: int | None) -> LabeledLane:
+def _shape(element: Element, where: str, label: str, lane_id: int | None) -> DrawnShape:
+    # The points of a skeleton are elements of their own.
+    parts = list(element.iterfind("points")) if element.tag == "skeleton" else [element]
+    texts = [part.attrib["points"] for part in parts if part.get("outside") != "1"] if _matters(element, label) else []
     try:
-        points = points_of([[float(n) for n in pair.split(",")] for pair in shape.attrib["points"].split(";") if pair])
+        points = points_of([[float(n) for n in pair.split(",")] for text in texts for pair in text.split(";") if pair])
     except ValueError:
         raise ValueError(f"{where}: its points are not pairs of numbers") from None
-    attributes = {str(a.get("name")).lower(): (a.text or "").strip().lower() for a in shape.iterfind("attribute")}
-    words = re.findall(r"[a-z]+", label.lower())
-    kind = kind_in([attributes.get("type", ""), attributes.get("kind", ""), *words])
-    color = color_in([attributes.get("color", ""), attributes.get("colour", ""), *words])
+    attributes = {str(a.get("name")).lower(): (a.text or "").strip().lower() for a in element.iterfind("attribute")}
+    words = words_of(label)
+    look = LabeledLook.of(
+        [attributes.get("type", ""), attributes.get("kind", ""), *words],
+        [attributes.get("color", ""), attributes.get("colour", ""), *words],
+    )
     position = attributes.get("position", "")
     if lane_id is None and attributes.get("id", "").isdecimal():
         lane_id = int(attributes["id"])
-    return LabeledLane(points, lane_id, int(position) if _POSITION.fullmatch(position) else None, kind, color)
+    lane_position = int(position) if _POSITION.fullmatch(position) else None
+    lane = LabeledLane(points, lane_id, lane_position, look.type, look.color, look.default_kind)
+    group = element.get("group_id", "0")
+    return DrawnShape(where, element.tag, label, lane, lane_id if group == "0" else group)
 
 
-def _track_entries(export: _Export) -> LabelEntries:
-    """Yields the frames in which a track has a visible polyline."""
-    frames: dict[int, dict[str, LabeledLane]] = {}
-    for track in export.root.iterfind("track"):
-        where = f"track {track.get('id')}"
-        for shape in track.iterfind("polyline"):
-            if shape.get("outside") == "1":
-                continue
-            try:
-                lane = _lane(shape, where, track.get("label", ""), int(track.attrib["id"]))
-                frames.setdefault(int(shape.attrib["frame"]), {})[where] = lane
-            except (ValueError, KeyError) as error:
-                yield field_error(f"{export.path}: {where}", error, "an id, and polylines with frame and points")
+def _matters(element: Element, label: str) -> bool:
+    return may_be_boundary(element.tag, label) and element.tag in _WITH_POINTS
+
+
+def _track_entries(export: CvatExport) -> LabelEntries:
+    """Yields the frames in which a track has a visible shape that is a boundary."""
+    frames: dict[int, list[DrawnShape]] = {}
+    others: Counter[str] = Counter()
+    for found in _track_shapes(export):
+        if isinstance(found, LabelError):
+            yield found
+        elif may_be_boundary(found[1].tool, found[1].label):
+            frames.setdefault(found[0], []).append(found[1])
+        else:
+            others[found[1].name] += 1
     if not frames:
+        yield from [no_boundaries(export.path, others)] if others else []
         return
+    task = export.task()
     try:
-        task = _VideoTask.of(export)
-    except ValueError as error:
-        yield field_error(str(export.path), error, "an original_size of whole numbers")
-        return
+        task.require_images()
+        size = export.size
     except LabelError as error:
         yield error_at(str(export.path), error)
+        return
+    except ValueError as error:
+        yield field_error(str(export.path), error, "an original_size of whole numbers")
         return
     for index in sorted(frames):
         location = f"{export.path}: frame {index}"
         try:
-            yield task.entry(index, location, frames[index])
+            yield _entry(
+                location, task.numbered_frame(index), DrawnBoundaries.of(frames[index], "CVAT", size and size[0]), size
+            )
         except LabelError as error:
             yield error_at(location, error)
 
 
-@dataclass(frozen=True)
-class _VideoTask:
-    """A video task and where its frames are: exported as images next to the labels, or else in the video.
-
-    If there is no folder `images` next to the labels, the video is looked for there and in the folder `clips`.
-    """
-
-    export: _Export
-    video: Path | None
-    group: str
-    size: tuple[int, int] | None
-
-    @classmethod
-    def of(cls, export: _Export) -> _VideoTask:
-        name = export.text("meta/task/source", "meta/source") or export.text("meta/task/name") or export.path.stem
-        source, folder, base = path_in_labels(name), export.folder, export.path.parent
-        size = [
-            export.text(f"meta/task/original_size/{side}", f"meta/original_size/{side}") for side in ("width", "height")
-        ]
-        video = None
-        if not (base / "images").is_dir():
-            video = folder.find(base / source, folder.root / source, folder.root / "clips" / source)
-        return cls(export, video, source.stem, size_of(*size) if all(size) else None)
-
-    def entry(self, index: int, location: str, lanes: dict[str, LabeledLane]) -> LabelEntry:
-        """Returns the entry of a frame. Raises LabelError if its image is missing."""
-        if self.video is not None:
-            source, image = f"{self.video.name}#{index}", ImageLocation(self.video, index)
-        else:
-            path = self.export.folder.find_image(self.export.path.parent / "images" / f"frame_{index:06d}")
-            source, image = self.export.folder.name(path), ImageLocation(path)
-        return LabelEntry(location, source, self.group, image, lanes, self.size, self.video, index)
+def _track_shapes(export: CvatExport) -> Iterator[tuple[int, DrawnShape] | LabelError]:
+    """Yields the visible shapes of all tracks with their frames, and faulty ones as their errors."""
+    for track in export.root.iterfind("track"):
+        where = f"track {track.get('id')}"
+        for element in track:
+            if element.tag not in _SHAPES or element.get("outside") == "1":
+                continue
+            try:
+                shape = _shape(element, where, track.get("label", ""), int(track.attrib["id"]))
+                yield int(element.attrib["frame"]), shape
+            except (ValueError, KeyError) as error:
+                yield field_error(f"{export.path}: {where}", error, "an id, and polylines with frame and points")

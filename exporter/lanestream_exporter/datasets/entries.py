@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from lanestream.errors import LabelError
+from lanestream.road.appearance import MARKING_COLORS, BoundaryKind
 from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.images import ImageLocation
-from lanestream_exporter.datasets.labels import LabeledLane
+from lanestream_exporter.datasets.labels import LANE_TYPES, PARTIAL, ROAD_EDGE_TYPES, Coverage, LabeledLane
 
-_KINDS: Final[Mapping[str, str]] = {
-    **{kind: kind for kind in ("solid", "dashed", "double", "botts", "edge")},
+# The words that label files use for the types of boundaries.
+_TYPES: Final[Mapping[str, str]] = {
+    **{name: name for name in LANE_TYPES},
     "broken": "dashed",
     "dash": "dashed",
     "continuous": "solid",
-    "curb": "edge",
-    "kerb": "edge",
+    "botts": "dots",
+    "curb": "kerb",
 }
+_OTHER_COLORS: Final = frozenset(
+    {"blue", "red", "orange", "green"}
+)  # of paint that counts as a marking without a color
+_UNPAINTED: Final = "none"
+UNKNOWN: Final = "unknown"
 _LONGEST_SIDE: Final = 1 << 20  # pixels
-_COLORS: Final = frozenset({"white", "yellow", "blue", "red", "orange"})
+
+FieldValue = str | bool | int | float
+Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,12 @@ class LabelEntry:
     `location` is where the record stands, `file:line` or `file: element`; the keys of `lanes` are locations within it.
     `size` is the (width, height) of the image if the labels give it. `video` and `index` name the video that the frame
     was taken from and its number there, if known. `split` is the record's own split. `extends_beyond_image` is true
-    for formats whose boundaries run on outside the image. `others` names labeled shapes that are not lines.
+    for formats whose boundaries run on outside the image. `converted` names the tools of the boundaries that were not
+    drawn as lines, and `others` names labeled shapes that are not boundaries. `fields` has the record's own words and
+    numbers, such as the light.
+
+    The manifest adds what it says about the whole data set: its name, the `coverage` of its labels, the `horizon` as a
+    share of the height, and `masks`, boxes (left, top, right, bottom) in shares of width and height that are not road.
     """
 
     location: str
@@ -44,7 +58,13 @@ class LabelEntry:
     index: int | None = None
     split: str | None = None
     extends_beyond_image: bool = False
+    converted: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
+    fields: Mapping[str, FieldValue] = field(default_factory=dict)
+    dataset: str = ""
+    coverage: Coverage = PARTIAL
+    horizon: float | None = None
+    masks: tuple[Box, ...] = ()
 
 
 LabelEntries = Iterator[LabelEntry | LabelError]
@@ -66,14 +86,39 @@ def numbered(lanes: Iterable[LabeledLane], noun: str = "lane") -> dict[str, Labe
     return {f"{noun} {number}": lane for number, lane in enumerate(lanes, start=1)}
 
 
-def kind_in(words: Iterable[str]) -> str | None:
-    """Returns the kind of marking, in this project's terms, that one of `words` names."""
-    return next((_KINDS[word] for word in words if word in _KINDS), None)
+@dataclass(frozen=True)
+class LabeledLook:
+    """The type, color and default kind of a labeled boundary, as LabeledLane explains them."""
+
+    type: str | None = None
+    color: str | None = None
+    default_kind: BoundaryKind | None = None
+
+    @classmethod
+    def of(cls, type_words: Iterable[str], color_words: Iterable[str]) -> LabeledLook:
+        """Returns the look that lower-case words describe, which may be the same for type and color.
+
+        An edge of the road has no paint: the color "none" makes a boundary of unknown type an edge. An edge whose color
+        is unknown may be painted, so nothing is known about it.
+        """
+        colors = set(color_words)
+        named = next((_TYPES[word] for word in type_words if word in _TYPES), None)
+        if named in ROAD_EDGE_TYPES:
+            return cls() if UNKNOWN in colors else cls(named)
+        if named is None and _UNPAINTED in colors:
+            return cls("edge")
+        color = next((name for name in MARKING_COLORS if name in colors), None)
+        return cls(named, color, None if colors.isdisjoint(_OTHER_COLORS) else "marking")
 
 
-def color_in(words: Iterable[str]) -> str | None:
-    """Returns the color that one of `words` names."""
-    return next((word for word in words if word in _COLORS), None)
+def is_type(word: str) -> bool:
+    """Whether `word` names the type of a boundary, or says that it is unknown."""
+    return is_boundary_type(word) or word == UNKNOWN
+
+
+def is_boundary_type(word: str) -> bool:
+    """Whether a lower-case word names the type of a boundary."""
+    return word in _TYPES
 
 
 def size_of(width: Any, height: Any) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 from collections.abc import Iterator
@@ -14,8 +15,11 @@ from lanestream.errors import LabelError, LanestreamError
 # Folders of labels that usually stand next to the folder of images rather than above it.
 _LABEL_FOLDERS: Final = frozenset({"labels", "annotations", "json"})
 IMAGE_FOLDERS: Final = ("images", "image", "imgs", "img", "frames")
-_IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp")
+IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp")
+_VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
 _JSON_LINES: Final = "one JSON object per line is accepted"
+_START_BYTES: Final = 1 << 16
+_UTF_16_MARKS: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 @dataclass(frozen=True)
@@ -32,11 +36,13 @@ class DataFolder:
     def at(cls, path: Path) -> DataFolder:
         """Returns the data set at `path`, a folder or one label file. Raises LabelError if nothing is there."""
         if path.is_file():
-            is_label_folder = path.absolute().parent.name in _LABEL_FOLDERS
+            is_label_folder = path.absolute().parent.name.lower() in _LABEL_FOLDERS
             return cls(path.parent / ".." if is_label_folder else path.parent, (path,))
         if not path.is_dir():
             raise LabelError(f"there is nothing at {path}", "give a folder of labeled frames, or a label file")
-        return cls(path, tuple(sorted(file for file in path.rglob("*") if file.is_file())))
+        return cls(
+            path, tuple(sorted(file for file in path.rglob("*") if file.is_file() and not _is_hidden(file, path)))
+        )
 
     def with_suffix(self, *suffixes: str) -> list[Path]:
         """Returns the files whose names end in one of `suffixes`."""
@@ -46,7 +52,8 @@ class DataFolder:
         """Returns the first of `paths` that is a file.
 
         Raises LabelError if none is, or if one of them is outside the folder, whether or not it exists: labels from
-        a third party must not make other files readable. Links inside the folder are followed.
+        a third party must not make other files readable. Links inside the folder are followed. A suffix may be in
+        upper case in one place and in lower case in the other.
         """
         root = _normalized(self.root)
         for path in paths:
@@ -55,21 +62,25 @@ class DataFolder:
                     f"{path} is outside the data set's folder", "give the folder that holds both labels and images"
                 )
         for path in paths:
-            if _is_file(path):
-                return path
+            found = next(filter(_is_file, _spellings(path)), None)
+            if found is not None:
+                return found
         raise LabelError(f"there is no file {_normalized(paths[0]).relative_to(root)}")
 
     def find_image(self, path: Path) -> Path:
         """Returns the image at `path`, which has no suffix. Raises LabelError as `find` does."""
-        return self.find(*(path.with_name(path.name + suffix) for suffix in _IMAGE_SUFFIXES))
+        return self.find(*(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES))
 
     def find_video(self, name: Path, labels: Path) -> Path:
         """Returns the video `name` of the label file `labels`. Raises LabelError as `find` does.
 
-        It is looked for next to the labels, in the folders `clips` and `videos` of the data set, and at its root.
+        It is looked for next to the labels, in the folders `clips` and `videos` of the data set, and at its root. If
+        `name` has no suffix of a video, any is accepted.
         """
-        root = self.root
-        return self.find(labels.parent / name, root / "clips" / name, root / "videos" / name, root / name)
+        is_whole = name.suffix.lower() in _VIDEO_SUFFIXES
+        names = [name] if is_whole else [name.with_name(name.name + suffix) for suffix in (*_VIDEO_SUFFIXES, "")]
+        folders = labels.parent, self.root / "clips", self.root / "videos", self.root
+        return self.find(*(folder / each for folder in folders for each in names))
 
     def name(self, path: Path) -> str:
         """Returns the name of `path` within the data set."""
@@ -81,7 +92,7 @@ def drive_of(folder: Path) -> str:
 
     The name is the last two parts of the path, leaving out folders that only say that they hold images.
     """
-    return "/".join([part for part in _normalized(folder).parts if part not in IMAGE_FOLDERS][-2:])
+    return "/".join([part for part in _normalized(folder).parts if part.lower() not in IMAGE_FOLDERS][-2:])
 
 
 def path_in_labels(name: str) -> Path:
@@ -92,7 +103,10 @@ def path_in_labels(name: str) -> Path:
 
 
 def read_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yields (location, object) of each line in `path`; locations are `file:line`. Raises LabelError for bad lines."""
+    """Yields (location, object) of each line in `path` that is not blank; locations are `file:line`.
+
+    Raises LabelError for bad lines.
+    """
     for location, record in scan_json_lines(path):
         if isinstance(record, LabelError):
             raise record
@@ -102,11 +116,13 @@ def read_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 def scan_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelError]]:
     """Like `read_json_lines`, but yields the error of a bad line instead of raising it, and continues."""
     try:
-        lines = read_text(path).splitlines()
+        lines = read_lines(path)
     except LabelError as error:
         yield str(path), error
         return
     for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
         location = f"{path}:{number}"
         try:
             yield location, json_object(line, location, _JSON_LINES)
@@ -115,13 +131,32 @@ def scan_json_lines(path: Path) -> Iterator[tuple[str, dict[str, Any] | LabelErr
 
 
 def read_text(path: Path, accepted: str = _JSON_LINES) -> str:
-    """Returns the text of the file `path`. Raises LabelError if it can't be read or is not a text file."""
+    """Returns the text of the file `path`, in UTF-8 or as Windows writes it, in UTF-16 with a byte order mark.
+
+    Raises LabelError if it can't be read or is not a text file.
+    """
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return _decoded(path.read_bytes())
     except OSError as error:
         raise LabelError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
     except UnicodeDecodeError:
         raise LabelError(f"{path} is not a text file", accepted) from None
+
+
+def read_lines(path: Path, accepted: str = _JSON_LINES) -> list[str]:
+    """Returns the lines of the file `path`, which end as on any system. Raises LabelError as `read_text` does."""
+    # Not splitlines, which also splits at characters that may stand in the text of a label.
+    return read_text(path, accepted).replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def start_of(path: Path) -> bytes:
+    """Returns the start of the file `path` in UTF-8, to recognize its format by; nothing if it can't be read."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(_START_BYTES)
+    except OSError:
+        return b""
+    return start.decode("utf-16", errors="ignore").encode() if start.startswith(_UTF_16_MARKS) else start
 
 
 def json_object(text: str, location: str, accepted: str) -> dict[str, Any]:
@@ -152,8 +187,25 @@ def _normalized(path: Path) -> Path:
     return Path(os.path.normpath(path.absolute()))
 
 
+def _is_hidden(path: Path, root: Path) -> bool:
+    """Whether a program keeps the file `path` below `root` for itself, such as the ._NAME files of macOS."""
+    return any(part.startswith(".") for part in path.relative_to(root).parts)
+
+
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
     except OSError:  # a name that is longer than the system allows
         return False
+
+
+def _decoded(data: bytes) -> str:
+    return data.decode("utf-16" if data.startswith(_UTF_16_MARKS) else "utf-8-sig")
+
+
+def _spellings(path: Path) -> Iterator[Path]:
+    """Yields `path`, then with its suffix in lower and in upper case."""
+    yield path
+    for suffix in (path.suffix.lower(), path.suffix.upper()):
+        if suffix != path.suffix:
+            yield path.with_suffix(suffix)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Final
 
 from lanestream.errors import LabelError
@@ -12,9 +11,10 @@ from lanestream_exporter.datasets.clips import clip_entries, is_clip_labels
 from lanestream_exporter.datasets.culane import culane_entries, is_culane
 from lanestream_exporter.datasets.cvat import cvat_entries, is_cvat
 from lanestream_exporter.datasets.entries import LabelFormat
-from lanestream_exporter.datasets.files import DataFolder
+from lanestream_exporter.datasets.files import DataFolder, start_of
 from lanestream_exporter.datasets.labelme import is_labelme, labelme_entries
 from lanestream_exporter.datasets.masks import is_mask, mask_entries
+from lanestream_exporter.datasets.other_programs import refuse_other_programs
 from lanestream_exporter.datasets.tusimple import is_tusimple, tusimple_entries
 
 # A file belongs to the first format that recognizes it.
@@ -30,7 +30,6 @@ FORMATS: Final[Mapping[str, LabelFormat]] = {
 AUTO: Final = "auto"
 
 _TEXT_SUFFIXES: Final = (".json", ".jsonl", ".xml")
-_START_BYTES: Final = 1 << 16  # of a JSON or XML file, to recognize it by
 _MOST_TEXT_FILES: Final = 100  # read to recognize a data set
 
 
@@ -38,6 +37,7 @@ def format_of(folder: DataFolder, name: str = AUTO) -> str:
     """Returns the format to read `folder` in: `name`, or for "auto" the one that its files have.
 
     Raises LabelError if `name` is unknown, if no labels are found, or if the files have several formats.
+    For labels of a program that is not read, the error names the program.
     """
     if name in FORMATS:
         return name
@@ -45,6 +45,7 @@ def format_of(folder: DataFolder, name: str = AUTO) -> str:
         raise LabelError(f"unknown label format {name!r}", f"{', '.join(FORMATS)} and {AUTO} are accepted")
     found = _formats_of_files(folder)
     if not found:
+        refuse_other_programs(folder)
         raise LabelError(
             f"no labels of a known format in {folder.root}", f"{', '.join(FORMATS)} are read; name one with --format"
         )
@@ -62,14 +63,6 @@ def _formats_of_files(folder: DataFolder) -> set[str]:
         start = b""
         if path.suffix.lower() in _TEXT_SUFFIXES:
             text_files += 1
-            start = _start_of(path) if text_files <= _MOST_TEXT_FILES else b""
+            start = start_of(path) if text_files <= _MOST_TEXT_FILES else b""
         found |= set(next(([name] for name, form in FORMATS.items() if form.recognizes(path, start)), []))
     return found
-
-
-def _start_of(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(_START_BYTES)
-    except OSError:
-        return b""

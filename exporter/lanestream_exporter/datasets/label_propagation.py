@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from lanestream.detection.curve_fit import FitSettings, fit_curves
-from lanestream.detection.features import paint_gray
+from lanestream.detection.features import Channels
 from lanestream.images.resizing import working_image
 from lanestream.road.curve import Curve, Curves, FloatArray
 from lanestream.road.view import Image, RoadView, Scaling, Spans
@@ -110,7 +110,7 @@ def _fit_pass(curves: Curves, steps: Sequence[_Step], images: Sequence[Image]) -
         view = step.view
         spans = replace(step.spans, top=np.maximum(step.spans.top, view.row_at(_TOP_SHARE)))
         start = fitted[-1].below(view.horizon, view.bottom)
-        fitted.append(fit_curves(paint_gray(image), start, spans, view, _FIT).curves)
+        fitted.append(fit_curves(Channels.of(image), start, spans, view, _FIT).curves)
     return fitted
 
 
@@ -124,7 +124,7 @@ class _KeyBoundary:
 
 
 class _KeyFrame:
-    """A labeled frame at one end of a stretch: its boundaries by lane id, without ids that are not unique.
+    """A labeled frame at one end of a stretch: its markings by lane id, without ids that are not unique.
 
     All is in pixels of working images; the `horizon` that it is made with is in pixels of the frame. `complete` says
     that these are all labels of the frame.
@@ -134,10 +134,10 @@ class _KeyFrame:
         horizon = Scaling.to_working_width(frame.width).to_working(horizon)
         self.index, self.frame = index, frame.at_working_width
         self.view = RoadView(self.frame.width, self.frame.height, horizon)
-        counts = Counter(lane.lane_id for lane in self.frame.lanes)
-        unique = {
-            lane.lane_id: lane for lane in self.frame.lanes if lane.lane_id is not None and counts[lane.lane_id] == 1
-        }
+        # Edges of the road have no paint that could be followed.
+        followed = [lane for lane in self.frame.lanes if lane.kind != "road_edge"]
+        counts = Counter(lane.lane_id for lane in followed)
+        unique = {lane.lane_id: lane for lane in followed if lane.lane_id is not None and counts[lane.lane_id] == 1}
         boundaries = {lane_id: self._boundary(lane) for lane_id, lane in unique.items()}
         self.boundaries = {lane_id: found for lane_id, found in boundaries.items() if found is not None}
         self.complete = len(self.boundaries) == len(frame.lanes)

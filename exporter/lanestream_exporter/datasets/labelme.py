@@ -1,20 +1,19 @@
-"""Reads LabelMe's labels: one JSON file per image, whose `shapes` of type line strip and line are lane boundaries.
+"""Reads LabelMe's labels: one JSON file per image. Line strips and lines among its `shapes` are lane boundaries.
 
-A shape's `group_id` is the boundary's id; words of its `label` and its `flags` may name kind and color ("dashed",
-"white"). The image is at `imagePath`, next to the JSON file under that name, or inside it as `imageData`. Coordinates
-are taken as written.
+Polygons and points are converted as `shapes` explains. A shape's `group_id` is the boundary's id; words of its `label`
+and its `flags` may name type and color ("dashed", "white"). The image is at `imagePath`, next to the JSON file under
+that name, or inside it as `imageData`. Coordinates are taken as written.
 """
 
 from __future__ import annotations
 
 import base64
 import binascii
-import re
 from pathlib import Path
 from typing import Any, Final
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, color_in, kind_in, size_of
+from lanestream_exporter.datasets.entries import LabeledLook, LabelEntries, LabelEntry, size_of
 from lanestream_exporter.datasets.files import (
     DataFolder,
     drive_of,
@@ -26,9 +25,9 @@ from lanestream_exporter.datasets.files import (
 )
 from lanestream_exporter.datasets.images import ImageLocation
 from lanestream_exporter.datasets.labels import LabeledLane, points_of
+from lanestream_exporter.datasets.shapes import DrawnBoundaries, DrawnShape, may_be_boundary, words_of
 
 _ACCEPTED: Final = "a JSON file of LabelMe is accepted"
-_LINES: Final = ("linestrip", "line")
 
 
 def is_labelme(path: Path, start: bytes) -> bool:
@@ -54,29 +53,30 @@ def labelme_entries(folder: DataFolder) -> LabelEntries:
 
 
 def _entry(record: dict[str, Any], path: Path, folder: DataFolder) -> LabelEntry:
-    lanes, others = {}, []
-    for number, shape in enumerate(record["shapes"], start=1):
-        shape_type = shape.get("shape_type") or "polygon"
-        if shape_type in _LINES:
-            lanes[f"shape {number}"] = _lane(shape, number)
-        else:
-            others.append(str(shape_type))
     image = _image(record, path, folder)
     width, height = record.get("imageWidth"), record.get("imageHeight")
     size = size_of(width, height) if width and height else None
-    source = folder.name(image.path)
-    return LabelEntry(str(path), source, drive_of(image.path.parent), image, lanes, size, others=tuple(others))
+    shapes = [_shape(shape, f"shape {number}") for number, shape in enumerate(record["shapes"], start=1)]
+    drawn = DrawnBoundaries.of(shapes, "LabelMe", size[0] if size else None)
+    source, group = folder.name(image.path), drive_of(image.path.parent)
+    return LabelEntry(
+        str(path), source, group, image, drawn.lanes, size, converted=drawn.converted, others=drawn.others
+    )
 
 
-def _lane(shape: dict[str, Any], number: int) -> LabeledLane:
+def _shape(shape: dict[str, Any], where: str) -> DrawnShape:
+    tool, label = str(shape.get("shape_type") or "polygon"), str(shape.get("label") or "")
     try:
-        points = points_of(shape["points"])
+        points = points_of(shape["points"] if may_be_boundary(tool, label) else [])
     except ValueError as error:
-        raise ValueError(f"shape {number}: {error}") from None
+        raise ValueError(f"{where}: {error}") from None
     flags = " ".join(name for name, is_set in (shape.get("flags") or {}).items() if is_set)
-    words = re.findall(r"[a-z]+", f"{shape.get('label', '')} {flags}".lower())
+    words = words_of(f"{label} {flags}")
+    look = LabeledLook.of(words, words)
     group = shape.get("group_id")
-    return LabeledLane(points, None if group is None else int(group), None, kind_in(words), color_in(words))
+    lane_id = None if group is None else int(group)
+    lane = LabeledLane(points, lane_id, None, look.type, look.color, look.default_kind)
+    return DrawnShape(where, tool, label, lane, lane_id)
 
 
 def _image(record: dict[str, Any], path: Path, folder: DataFolder) -> ImageLocation:

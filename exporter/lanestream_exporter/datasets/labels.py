@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.images.resizing import working_image
+from lanestream.road.appearance import MARKING_TYPES, BoundaryKind
 from lanestream.road.curve import Curve, FloatArray, curve_basis
 from lanestream.road.view import WORKING_WIDTH, Image, RoadView, Scaling
 
 # How far, in pixels, a labeler's point may lie outside the image or go back down the boundary by mistake.
 POINT_TOLERANCE: Final = 1.0
+
+# A kerb is labeled at its foot, an edge where the asphalt meets grass, sand or gravel.
+ROAD_EDGE_TYPES: Final = ("kerb", "edge")
+LANE_TYPES: Final = (*MARKING_TYPES, *ROAD_EDGE_TYPES)
 
 
 @dataclass(frozen=True)
@@ -24,13 +29,23 @@ class LabeledLane:
     `points` is an (N, 2) float array of image pixels (x right, y down, pixel centers at integers), from the lowest
     visible row upwards, on the center of the marking. `lane_id` stays with the physical boundary through a clip.
     `position` is -1 for ego left, +1 for ego right, -2 and +2 for the next ones out, or None if the labels don't say.
+    `type` is one of LANE_TYPES and `color` that of the paint; None if unknown. `default_kind` is the kind of a boundary
+    whose type and color are both unknown.
     """
 
     points: NDArray[np.float64]
     lane_id: int | None = None
     position: int | None = None
-    kind: str | None = None
+    type: str | None = None
     color: str | None = None
+    default_kind: BoundaryKind | None = None
+
+    @property
+    def kind(self) -> BoundaryKind | None:
+        """Whether it is a marking or an edge of the road; None if unknown."""
+        if self.type in ROAD_EDGE_TYPES:
+            return "road_edge"
+        return "marking" if self.type or self.color else self.default_kind
 
 
 @dataclass(frozen=True)
@@ -39,15 +54,19 @@ class Coverage:
 
     `ego`: both boundaries of the ego lane are labeled if visible, so one without a label is absent.
     `open_sides`: the sides (-1 left, 1 right) on which unlabeled boundaries may lie beyond the outermost label.
+    `edges`: edges of the road are labeled as markings are; if not, one beyond the outermost label is unknown.
+    `markings`: the frame may show markings; if not, nothing in it is one.
     """
 
     ego: bool = False
     open_sides: tuple[int, ...] = (-1, 1)
+    edges: bool = False
+    markings: bool = True
 
 
 PARTIAL = Coverage()
 EGO_LANE = Coverage(ego=True)
-WHOLE = Coverage(ego=True, open_sides=())
+WHOLE = Coverage(ego=True, open_sides=(), edges=True)
 
 
 @dataclass(frozen=True)
@@ -55,6 +74,9 @@ class LabeledFrame:
     """The labels of one frame: its size in pixels, its lane boundaries, and what they cover.
 
     `group` names the drive or clip that the frame belongs to; `source` names the frame within its data set.
+    `dataset` is that set's name in the manifest, empty without one. `horizon` is the image row of the horizon if the
+    labels give it, negative above the image. `conditions` says how and where the frame was taken ("light": "dusk"), for
+    figures by condition.
     """
 
     width: int
@@ -63,13 +85,18 @@ class LabeledFrame:
     group: str
     source: str
     coverage: Coverage = PARTIAL
+    dataset: str = ""
+    horizon: float | None = None
+    conditions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def at_working_width(self) -> LabeledFrame:
         """The same labels in pixels of the working image, which detectors see."""
         scaling = Scaling.to_working_width(self.width)
         lanes = tuple(replace(lane, points=scaling.to_working(lane.points)) for lane in self.lanes)
-        return replace(self, width=WORKING_WIDTH, height=max(1, round(scaling.factor * self.height)), lanes=lanes)
+        horizon = None if self.horizon is None else scaling.to_working(self.horizon)
+        height = max(1, round(scaling.factor * self.height))
+        return replace(self, width=WORKING_WIDTH, height=height, lanes=lanes, horizon=horizon)
 
     def open_to(self, side: int) -> bool:
         """Whether a boundary beyond the outermost label on `side` (-1 left, 1 right) is unknown rather than absent.

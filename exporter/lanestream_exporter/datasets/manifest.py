@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -17,28 +17,31 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import LabelEntry
+from lanestream.errors import LabelError, SettingsError
+from lanestream.road.appearance import BoundaryKind
+from lanestream_exporter.datasets.entries import FieldValue, LabelEntry
 from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.formats import AUTO, FORMATS
 from lanestream_exporter.datasets.images import ImageReader, video_size
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
-from lanestream_exporter.datasets.labels import Coverage, LabeledFrame, LabeledImages
+from lanestream_exporter.datasets.labels import Coverage, LabeledFrame, LabeledImages, LabeledLane
 from lanestream_exporter.datasets.reading import labeled_frame, open_entry, read_entries
 from lanestream_exporter.datasets.splits import (
     GroupSplit,
+    NamedSplit,
     Split,
     SplitField,
     WholeSplit,
     clip_frames,
-    split_by_group,
     split_of,
+    validation_groups_of,
 )
-from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, read_toml
+from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, Share, read_toml
 
 SHIPPED_MANIFEST: Final = CONFIG_FOLDER / "datasets.toml"
 _SHIPPED_DATA: Final = Path("../shared/data")
 _SIDES: Final = {"left": -1, "right": 1}
+_HORIZON_SHARES: Final = (-0.6, 1.0)  # of the height; the camera looks down if it is negative
 
 
 class CoverageSection(Section):
@@ -46,21 +49,35 @@ class CoverageSection(Section):
 
     ego: bool = False
     open_sides: tuple[Literal["left", "right"], ...] = ("left", "right")
+    edges: bool = False
+    markings: bool = True
 
     @property
     def coverage(self) -> Coverage:
         """The same for labeled frames."""
-        return Coverage(self.ego, tuple(sorted(_SIDES[side] for side in self.open_sides)))
+        return Coverage(self.ego, tuple(sorted(_SIDES[side] for side in self.open_sides)), self.edges, self.markings)
 
 
 class DatasetSpec(Section):
-    """One data set of a manifest: a folder or a label file, its split rule, and whom to credit for it."""
+    """One data set of a manifest: a folder or a label file, its split rule, and whom to credit for it.
+
+    `default_kind` is that of labels without type and color. `group` and `horizon` name the field of a record with the
+    drive, and the one with the horizon's row as a share of the height. Records with one of the fields `skip` are left
+    out. In records whose fields have one of the values in `ignore_colors`, colors are not trusted. `masks` are boxes
+    (left, top, right, bottom) in shares of width and height, such as logos; they are painted over in still images.
+    """
 
     name: Annotated[str, Field(min_length=1)]
     path: str
     format: str = AUTO
     split: SplitField
+    group: str | None = None
     coverage: CoverageSection = CoverageSection()
+    default_kind: BoundaryKind | None = None
+    horizon: str | None = None
+    skip: tuple[str, ...] = ()
+    ignore_colors: Annotated[dict[str, tuple[str, ...]], Field(default_factory=dict)]
+    masks: tuple[tuple[Share, Share, Share, Share], ...] = ()
     license: str | None = None
     credit: str | None = None
 
@@ -68,7 +85,44 @@ class DatasetSpec(Section):
     def _check(self) -> Self:
         if self.format != AUTO and self.format not in FORMATS:
             raise ValueError(f"unknown label format {self.format!r}; accepted are {AUTO}, {', '.join(FORMATS)}")
+        if any(left >= right or top >= bottom for left, top, right, bottom in self.masks):
+            raise ValueError("a box of masks is empty; give left, top, right and bottom")
         return self
+
+    def applied(self, entry: LabelEntry) -> LabelEntry:
+        """Returns a record of the data set with what the manifest says about it.
+
+        Raises LabelError if it lacks a field that the manifest names, or if its horizon is not accepted.
+        """
+        group = entry.group if self.group is None else str(self._field(entry, self.group))
+        lanes = {name: self._lane(lane, entry) for name, lane in entry.lanes.items()}
+        horizon = None if self.horizon is None else self._horizon(entry, self.horizon)
+        coverage = self.coverage.coverage
+        return replace(
+            entry, group=group, lanes=lanes, dataset=self.name, coverage=coverage, horizon=horizon, masks=self.masks
+        )
+
+    def _lane(self, lane: LabeledLane, entry: LabelEntry) -> LabeledLane:
+        if any(entry.fields.get(name) in values for name, values in self.ignore_colors.items()):
+            lane = replace(lane, color=None, default_kind=lane.kind)
+        return replace(lane, default_kind=lane.kind or self.default_kind)
+
+    def _horizon(self, entry: LabelEntry, name: str) -> float:
+        value = self._field(entry, name)
+        least, most = _HORIZON_SHARES
+        if isinstance(value, bool | str) or not least <= value <= most:
+            raise LabelError(
+                f"{entry.location}: its {name} {value!r} is not accepted",
+                f"a share of the height from {least:g} to {most:g} is, negative above the picture",
+            )
+        return float(value)
+
+    def _field(self, entry: LabelEntry, name: str) -> FieldValue:
+        if name not in entry.fields:
+            raise LabelError(
+                f"{entry.location}: the record has no {name}", f"the manifest names this field for {self.name!r}"
+            )
+        return entry.fields[name]
 
     @property
     def credit_record(self) -> dict[str, str]:
@@ -121,6 +175,15 @@ class DatasetCollection:
         default = _SHIPPED_DATA if manifest is None else path.parent
         return cls(read, Path(named) if named else default)
 
+    def without(self, names: Collection[str]) -> DatasetCollection:
+        """Returns the collection without the data sets of these names. Raises SettingsError for an unknown name."""
+        known = [spec.name for spec in self.manifest.dataset]
+        for name in names:
+            if name not in known:
+                raise SettingsError(f"the manifest has no data set {name!r}", f"its data sets are {', '.join(known)}")
+        kept = tuple(spec for spec in self.manifest.dataset if spec.name not in names)
+        return replace(self, manifest=self.manifest.model_copy(update={"dataset": kept}))
+
     @property
     def any_present(self) -> bool:
         """Whether the data folder holds at least one of the data sets."""
@@ -129,8 +192,8 @@ class DatasetCollection:
     def frames(self, split: Split) -> LabeledImages:
         """Yields the labeled frames of a split, one data set after another. Raises LabelError for a bad record."""
         with ImageReader() as images:
-            for spec, entry in self._entries(split):
-                for sample in open_entry(entry, images, spec.coverage.coverage):
+            for entry in self._entries(split):
+                for sample in open_entry(entry, images):
                     if isinstance(sample, LabelError):
                         raise sample
                     yield sample.frame, sample.image
@@ -152,7 +215,7 @@ class DatasetCollection:
             for entry in self._entries_of(spec, split):
                 if entry.video is not None and entry.index is not None:
                     size = entry.size or video_size(entry.video)
-                    frame, faults = labeled_frame(entry, size, spec.coverage.coverage)
+                    frame, faults = labeled_frame(entry, size)
                     if faults:
                         raise faults[0]
                     videos.setdefault(entry.video, {})[entry.index] = frame
@@ -186,10 +249,9 @@ class DatasetCollection:
                 digest.update(f"{file} {status.st_size} {status.st_mtime_ns}\n".encode())
         return digest.hexdigest()[:12]
 
-    def _entries(self, split: Split) -> Iterator[tuple[DatasetSpec, LabelEntry]]:
+    def _entries(self, split: Split) -> Iterator[LabelEntry]:
         for spec in self.manifest.dataset:
-            for entry in self._entries_of(spec, split):
-                yield spec, entry
+            yield from self._entries_of(spec, split)
 
     def _entries_of(self, spec: DatasetSpec, split: Split) -> Iterator[LabelEntry]:
         if isinstance(spec.split, WholeSplit) and spec.split.split != split:
@@ -202,7 +264,8 @@ class DatasetCollection:
         for entry in read_entries(self._path(spec), spec.format):
             if isinstance(entry, LabelError):
                 raise entry
-            yield entry
+            if not any(name in entry.fields for name in spec.skip):
+                yield spec.applied(entry)
 
     def _is_present(self, spec: DatasetSpec) -> bool:
         return (self.root / spec.path).exists()
@@ -218,7 +281,7 @@ class DatasetCollection:
 
     @cached_property
     def _validation_groups(self) -> dict[str, frozenset[str]]:
-        """The groups that each data set's GroupSplit chose to validate with, by the data set's name.
+        """The groups that each data set's split rule chose to validate with, by the data set's name.
 
         Raises LabelError if two data sets put the same drive or clip into different splits. Missing data sets are
         skipped here; they are reported when their frames are read.
@@ -226,9 +289,8 @@ class DatasetCollection:
         chosen: dict[str, frozenset[str]] = {spec.name: frozenset() for spec in self.manifest.dataset}
         parts: dict[str, set[tuple[Split, str]]] = {}  # by group: the splits and data sets that it is in
         for spec in filter(self._is_present, self.manifest.dataset):
-            if isinstance(spec.split, GroupSplit):
-                groups = (entry.group for entry in self._read(spec))
-                chosen[spec.name] = split_by_group(groups, spec.split.val, spec.split.seed).validation
+            if isinstance(spec.split, GroupSplit | NamedSplit):
+                chosen[spec.name] = validation_groups_of(spec.split, (entry.group for entry in self._read(spec)))
             for entry in self._read(spec):
                 split = split_of(spec.split, entry, chosen[spec.name])
                 if split is not None:

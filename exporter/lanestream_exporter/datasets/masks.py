@@ -35,8 +35,8 @@ _LEAST_ROWS: Final = 3  # a smaller piece is a speck
 
 def is_mask(path: Path, _start: bytes = b"") -> bool:
     """Whether the file at `path` is a mask, by its folder and name."""
-    in_folder = not _MASK_FOLDERS.isdisjoint(path.absolute().parent.parts[-3:])
-    return path.suffix.lower() == ".png" and (in_folder or path.stem.endswith(_STEM_END))
+    in_folder = not _MASK_FOLDERS.isdisjoint(part.lower() for part in path.absolute().parent.parts[-3:])
+    return path.suffix.lower() == ".png" and (in_folder or path.stem.lower().endswith(_STEM_END))
 
 
 def mask_entries(folder: DataFolder) -> LabelEntries:
@@ -55,11 +55,11 @@ def mask_entries(folder: DataFolder) -> LabelEntries:
 
 
 def _image_of(mask: Path, folder: DataFolder) -> Path:
-    if mask.stem.endswith(_STEM_END):
+    if mask.stem.lower().endswith(_STEM_END):
         return folder.find_image(mask.with_name(mask.stem[: -len(_STEM_END)]))
     parts = mask.absolute().with_suffix("").parts
-    at = max(number for number, part in enumerate(parts[:-1]) if part in _MASK_FOLDERS)
-    for name in IMAGE_FOLDERS:
+    at = max(number for number, part in enumerate(parts[:-1]) if part.lower() in _MASK_FOLDERS)
+    for name in (*IMAGE_FOLDERS, *map(str.capitalize, IMAGE_FOLDERS)):
         if Path(*parts[:at], name).is_dir():
             return folder.find_image(Path(*parts[:at], name, *parts[at + 1 :]))
     raise LabelError("there is no folder images next to its own", "the mask of images/NAME.jpg is masks/NAME.png")

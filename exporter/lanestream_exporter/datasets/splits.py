@@ -42,9 +42,13 @@ class RecordSplit(Section):
 
 
 class FrameSplit(Section):
-    """The videos are cut by frame numbers: from the first of a range up to, but not including, the second."""
+    """The videos are cut by frame numbers: from the first of a range up to, but not including, the second.
+
+    `field` names a field of the records that numbers the frames; without it, they have their numbers in the video.
+    """
 
     by: Literal["frame"]
+    field: str | None = None
     train: FrameRange | None = None
     val: FrameRange | None = None
     test: FrameRange | None = None
@@ -72,6 +76,13 @@ class GroupSplit(Section):
     seed: NonNegativeInt = 0
 
 
+class NamedSplit(Section):
+    """The drives or clips that `val` names validate. The others train."""
+
+    by: Literal["name"]
+    val: Annotated[tuple[str, ...], Field(min_length=1)]
+
+
 def _whole(value: Any) -> Any:
     """Returns the table that `split = "train"` stands for."""
     if not isinstance(value, str):
@@ -81,18 +92,18 @@ def _whole(value: Any) -> Any:
     return {"by": "whole", "split": value}
 
 
-SplitRule = WholeSplit | RecordSplit | FrameSplit | GroupSplit
+SplitRule = WholeSplit | RecordSplit | FrameSplit | GroupSplit | NamedSplit
 SplitField = Annotated[Annotated[SplitRule, Field(discriminator="by")], BeforeValidator(_whole)]
 
 
 def split_of(rule: SplitRule, entry: LabelEntry, validation_groups: frozenset[str]) -> Split | None:
-    """Returns the split of an entry, None if it is in none; `validation_groups` are those that a GroupSplit drew.
+    """Returns the split of an entry, None if it is in none; `validation_groups` are those of `validation_groups_of`.
 
     Raises LabelError if the labels lack what the rule needs.
     """
     if isinstance(rule, WholeSplit):
         return rule.split
-    if isinstance(rule, GroupSplit):
+    if isinstance(rule, GroupSplit | NamedSplit):
         return "val" if entry.group in validation_groups else "train"
     if isinstance(rule, RecordSplit):
         if entry.split not in SPLITS:
@@ -102,12 +113,29 @@ def split_of(rule: SplitRule, entry: LabelEntry, validation_groups: frozenset[st
                 f"a field `split` with {', '.join(SPLITS)} is accepted, or another split rule in the manifest",
             )
         return entry.split
-    if entry.index is None:
+    number = entry.index if rule.field is None else entry.fields.get(rule.field)
+    if not isinstance(number, int):
+        missing = "frame number" if rule.field is None else f"number {rule.field!r}"
         raise LabelError(
-            f"{entry.location}: {entry.source} has no frame number",
-            "frames can only be split by number if labels give it",
+            f"{entry.location}: {entry.source} has no {missing}", "frames can only be split by number if labels give it"
         )
-    return next((split for split in SPLITS if entry.index in rule.range_of(split)), None)
+    return next((split for split in SPLITS if number in rule.range_of(split)), None)
+
+
+def validation_groups_of(rule: SplitRule, groups: Iterable[str]) -> frozenset[str]:
+    """Returns the drives or clips that a rule validates with, of `groups`, which has that of every frame.
+
+    Raises LabelError if the rule names one that isn't there, or if there are too few to draw from.
+    """
+    if isinstance(rule, GroupSplit):
+        return split_by_group(groups, rule.val, rule.seed).validation
+    if not isinstance(rule, NamedSplit):
+        return frozenset()
+    found = set(groups)
+    missing = [name for name in rule.val if name not in found]
+    if missing:
+        raise LabelError(f"there is no drive or clip {missing[0]!r}", f"found are {', '.join(sorted(found))}")
+    return frozenset(rule.val)
 
 
 def clip_frames(rule: SplitRule, split: Split, labeled: Sequence[int]) -> range:

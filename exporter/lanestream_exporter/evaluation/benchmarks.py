@@ -24,7 +24,7 @@ from lanestream.road.curve import FloatArray
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
-from lanestream_exporter.samples.patches import columns_at
+from lanestream_exporter.samples.truth import columns_at
 
 # The benchmarks ask for the ego lane and the adjacent lane on either side.
 _MAX_POSITION: Final = 2

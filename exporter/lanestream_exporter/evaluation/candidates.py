@@ -12,7 +12,7 @@ from sklearn.metrics import average_precision_score
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.outcomes import MOST_RANKED, RULES, FrameEvaluation, JudgedCandidates
-from lanestream_exporter.samples.patches import FALSE, TRUE, UNKNOWN, UNSURE
+from lanestream_exporter.samples.truth import UNSURE, Verdicts
 
 _BINS = 10
 # Fields of JudgedCandidates that can be evaluated: the classifier's probabilities, or those of the detector's decision.
@@ -44,12 +44,12 @@ def _judged(
     truth, probability = clear_candidates(outcomes, rule, field)
     counts = np.array([_confusion(*_clear(judged, rule, field), threshold) for judged in _all(outcomes)]).reshape(-1, 4)
     frames = [outcome.frame for outcome in outcomes if outcome.candidates is not None]
-    verdicts = np.concatenate([judged.verdicts[rule] for judged in _all(outcomes)] or [np.zeros(0, np.int64)])
-    names = {"true": TRUE, "false": FALSE, "unsure": UNSURE, "unknown": UNKNOWN}
+    names = ("true", "false", "unsure", "unknown")
+    numbers = np.array([_numbers(judged.verdicts[rule]) for judged in _all(outcomes)]).reshape(-1, 4).sum(axis=0)
     both = truth.any() and not truth.all()
     return {
-        "candidates": len(verdicts),
-        **{name: int((verdicts == value).sum()) for name, value in names.items()},
+        "candidates": int(numbers.sum()),
+        **dict(zip(names, map(int, numbers), strict=True)),
         "confusion": dict(zip(("tp", "fp", "fn", "tn"), map(int, counts.sum(axis=0)), strict=True)),
         "base_rate": round(float(truth.mean()), 4) if len(truth) else None,
         **point_estimates(counts, frames, _rates),
@@ -122,9 +122,15 @@ def _all(outcomes: Sequence[FrameEvaluation]) -> list[JudgedCandidates]:
 
 def _clear(judged: JudgedCandidates, rule: str, field: ProbabilityField) -> tuple[NDArray[np.bool_], FloatArray]:
     verdicts = judged.verdicts[rule]
-    clear = (verdicts == TRUE) | (verdicts == FALSE)
+    clear = verdicts.is_true | verdicts.is_false
     probabilities: FloatArray = getattr(judged, field)
-    return verdicts[clear] == TRUE, probabilities[clear]
+    return verdicts.is_true[clear], probabilities[clear]
+
+
+def _numbers(verdicts: Verdicts) -> tuple[int, int, int, int]:
+    """Returns how many candidates are true, false, unsure and unknown."""
+    true, false, unsure = (int(mask.sum()) for mask in (verdicts.is_true, verdicts.is_false, verdicts.kinds == UNSURE))
+    return true, false, unsure, len(verdicts.kinds) - true - false - unsure
 
 
 def _confusion(truth: NDArray[np.bool_], probability: FloatArray, threshold: float) -> tuple[int, int, int, int]:

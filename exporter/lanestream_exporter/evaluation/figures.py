@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.benchmarks import culane_frame, tusimple_frame
 from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.boundaries import FrameMatches, errors_along, match, match_ego
-from lanestream_exporter.evaluation.outcomes import FrameEvaluation, ego_pair
+from lanestream_exporter.evaluation.outcomes import FrameEvaluation, ego_pair, markings_only
 
 _DEPTH_BINS = 10  # bins of the error by depth
 
@@ -20,7 +20,11 @@ _DEPTH_BINS = 10  # bins of the error by depth
 def boundary_figures(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns the figures of level B, for the ego pair and all boundaries; see docs/evaluation.md."""
     ego = [match_ego(outcome.reports, outcome.frame) for outcome in outcomes]
-    return {"ego": _matched(outcomes, ego), "all": _matched(outcomes, [match_all(outcome) for outcome in outcomes])}
+    return {
+        "ego": {"base_rate": _base_rate(ego), **_matched(outcomes, ego)},
+        # What is not a boundary can't be counted among all boundaries.
+        "all": {"base_rate": None, **_matched(outcomes, [match_all(outcome) for outcome in outcomes])},
+    }
 
 
 def match_all(outcome: FrameEvaluation) -> FrameMatches:
@@ -29,13 +33,22 @@ def match_all(outcome: FrameEvaluation) -> FrameMatches:
 
 
 def field_figures(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
-    """Returns the figures of level C, for all lanes and the ego pair; see docs/evaluation.md."""
-    pairs = [pair for outcome in outcomes if (pair := ego_pair(outcome)).frame.lanes]
+    """Returns the figures of level C, for all lanes and the ego pair; see docs/evaluation.md.
+
+    The benchmarks know markings only, so edges of the road are left out.
+    """
+    whole = _with_markings(outcomes)
+    pairs = _with_markings(map(ego_pair, outcomes))
     return {
-        "tusimple": _tusimple(outcomes),
-        "culane": _culane(outcomes),
+        "tusimple": _tusimple(whole),
+        "culane": _culane(whole),
         "ego": {"tusimple": _tusimple(pairs), "culane": _culane(pairs)},
     }
+
+
+def _with_markings(outcomes: Iterable[FrameEvaluation]) -> list[FrameEvaluation]:
+    """Returns the outcomes without edges of the road, of the frames that have a label then."""
+    return [marked for outcome in outcomes if (marked := markings_only(outcome)).frame.lanes]
 
 
 def _matched(outcomes: Sequence[FrameEvaluation], matched: Sequence[FrameMatches]) -> dict[str, Any]:
@@ -54,6 +67,12 @@ def _matched(outcomes: Sequence[FrameEvaluation], matched: Sequence[FrameMatches
         "error_by_depth": _by_depth(outcomes, matched),
         "intervals": intervals(counts, _frames(outcomes), _boundary_rates),
     }
+
+
+def _base_rate(matched: Sequence[FrameMatches]) -> float | None:
+    """Returns the share of the judged ego sides that have a boundary; None without sides."""
+    labeled, empty = sum(len(m.matches) + m.missed for m in matched), sum(m.empty for m in matched)
+    return round(labeled / (labeled + empty), 4) if labeled + empty else None
 
 
 def _boundary_rates(counts: FloatArray) -> dict[str, FloatArray]:

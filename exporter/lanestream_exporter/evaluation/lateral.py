@@ -20,7 +20,7 @@ from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.bootstrap import intervals, point_estimates, ratio
 from lanestream_exporter.evaluation.boundaries import ego_sides
 from lanestream_exporter.evaluation.outcomes import FrameEvaluation
-from lanestream_exporter.samples.patches import columns_at
+from lanestream_exporter.samples.truth import columns_at
 
 METERS: Final = (10.0, 30.0)
 _HEIGHT: Final = 1.45

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,14 @@ from lanestream_exporter.datasets.splits import Split
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary
 from lanestream_exporter.evaluation.candidates import candidate_figures
 from lanestream_exporter.evaluation.figures import boundary_figures, field_figures
+from lanestream_exporter.evaluation.kinds import kind_figures
 from lanestream_exporter.evaluation.lateral import lateral_figures
 from lanestream_exporter.evaluation.methods import Method
 from lanestream_exporter.evaluation.outcomes import FrameEvaluation
 from lanestream_exporter.evaluation.steadiness import steadiness
+from lanestream_exporter.evaluation.verdicts import verdicts
 
-SCHEMA = 2
+SCHEMA = 3
 OVERALL = "overall"
 
 
@@ -57,10 +59,9 @@ class ClipRun:
     size: tuple[int, int] = (1, 1)
 
     def figures(self) -> dict[str, Any]:
-        """Returns the level B figures with and without tracking, and the steadiness."""
+        """Returns the level B figures and those of kinds, with and without tracking, and the steadiness."""
         return {
-            "tracked": boundary_figures(self.tracked),
-            "alone": boundary_figures(self.alone),
+            **_clip_groups(self.tracked, self.alone),
             "steadiness": steadiness(self.reported, self.tracked, self.size),
         }
 
@@ -76,13 +77,16 @@ class Evaluation:
 
     def figures(self) -> dict[str, Any]:
         """Returns all figures as written to the JSON file; docs/evaluation.md documents every key."""
-        return {
+        figures = {
             "schema": SCHEMA,
             "material": self.evaluation_set.name,
             "methods": {m.name: {"kind": m.kind, "regressor": m.regressor} for m in self.methods},
             "images": {method.name: self._image_figures(method) for method in self.methods},
+            "datasets": {name: _part_figures(by_dataset(outcomes)) for name, outcomes in self.images.items()},
+            "conditions": {name: _part_figures(by_condition(outcomes)) for name, outcomes in self.images.items()},
             "clips": {method.name: self._clip_figures(method) for method in self.methods},
         }
+        return {**figures, "verdicts": verdicts(figures)}
 
     def _image_figures(self, method: Method) -> dict[str, Any]:
         outcomes = self.images[method.name]
@@ -95,13 +99,14 @@ class Evaluation:
             return {}
         tracked = [outcome for run in runs.values() for outcome in run.tracked]
         alone = [outcome for run in runs.values() for outcome in run.alone]
-        return {**figures, OVERALL: {"tracked": boundary_figures(tracked), "alone": boundary_figures(alone)}}
+        return {**figures, OVERALL: _clip_groups(tracked, alone)}
 
 
 def image_figures(method: Method, outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns all figure groups of a method on single images. A new group is one more entry here."""
     figures: dict[str, Any] = {
         "boundaries": boundary_figures(outcomes),
+        "kinds": kind_figures(outcomes),
         "lateral": lateral_figures(outcomes),
         "field": field_figures(outcomes),
     }
@@ -116,6 +121,36 @@ def by_drive(outcomes: Sequence[FrameEvaluation]) -> dict[str, list[FrameEvaluat
     for outcome in outcomes:
         drives.setdefault(outcome.frame.group, []).append(outcome)
     return {**drives, OVERALL: list(outcomes)}
+
+
+def by_dataset(outcomes: Sequence[FrameEvaluation]) -> dict[str, list[FrameEvaluation]]:
+    """Returns the outcomes of each data set of a manifest; those of frames without a data set are left out."""
+    parts: dict[str, list[FrameEvaluation]] = {}
+    for outcome in outcomes:
+        if outcome.frame.dataset:
+            parts.setdefault(outcome.frame.dataset, []).append(outcome)
+    return parts
+
+
+def by_condition(outcomes: Sequence[FrameEvaluation]) -> dict[str, list[FrameEvaluation]]:
+    """Returns the outcomes under each condition, by names like `light: dusk`, in alphabetical order."""
+    parts: dict[str, list[FrameEvaluation]] = {}
+    for outcome in outcomes:
+        for name, value in outcome.frame.conditions.items():
+            parts.setdefault(f"{name}: {value}", []).append(outcome)
+    return dict(sorted(parts.items()))
+
+
+def _part_figures(parts: Mapping[str, Sequence[FrameEvaluation]]) -> dict[str, Any]:
+    return {name: {"boundaries": boundary_figures(part), "kinds": kind_figures(part)} for name, part in parts.items()}
+
+
+def _clip_groups(tracked: Sequence[FrameEvaluation], alone: Sequence[FrameEvaluation]) -> dict[str, Any]:
+    return {
+        "tracked": boundary_figures(tracked),
+        "alone": boundary_figures(alone),
+        "kinds": {"tracked": kind_figures(tracked), "alone": kind_figures(alone)},
+    }
 
 
 def run_evaluation(

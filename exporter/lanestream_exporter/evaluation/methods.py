@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.candidate_detector import CandidateDetector
-from lanestream.detection.features import paint_gray
+from lanestream.detection.classification import Classification
 from lanestream.detection.interface import FrameContext, ModelRole
 from lanestream.detection.patches import cut_patches
 from lanestream.detection.proposals import MOST_CANDIDATES
@@ -80,9 +80,9 @@ class ServedModel:
 
     def _judge(self, detector: CandidateDetector, frame: LabeledFrame, image: Image) -> JudgedCandidates:
         """Judges the candidates of a working image: the same search as in `detect`, with more results."""
-        proposals = detector.propose(image, paint_gray(image), FrameContext(), self._infer, MOST_RANKED)
+        proposals = detector.propose(image, FrameContext(), self._infer, MOST_RANKED)
         patches = cut_patches(image, proposals.curves, proposals.spans, proposals.view, detector.patch)
-        return judge(proposals, self._infer("classifier", patches[:MOST_CANDIDATES]), frame)
+        return judge(proposals, Classification.of(self._infer("classifier", patches[:MOST_CANDIDATES])), frame)
 
     def _infer(self, role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         return self._engine.models[role].run(inputs)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.candidate_detector import BOUNDARY, CandidateDetector
+from lanestream.detection.candidate_detector import CandidateDetector
+from lanestream.detection.classification import Classification
 from lanestream.detection.proposals import Proposals
 from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_sides
-from lanestream_exporter.samples.patches import TruthRule
+from lanestream_exporter.samples.truth import TruthRule, Verdicts
 
 # The most candidates whose ranks are evaluated; the classifier sees fewer in service.
 MOST_RANKED = 32
@@ -36,7 +37,7 @@ class JudgedCandidates:
 
     probabilities: NDArray[np.float64]
     decided: NDArray[np.float64]
-    verdicts: dict[str, NDArray[np.int64]]
+    verdicts: dict[str, Verdicts]
     proposed: tuple[LabelProposal, ...]
 
 
@@ -56,12 +57,19 @@ def ego_pair(outcome: FrameEvaluation) -> FrameEvaluation:
     return FrameEvaluation(replace(outcome.frame, lanes=lanes), reports)
 
 
-def judge(proposals: Proposals, outputs: NDArray[np.float32], frame: LabeledFrame) -> JudgedCandidates:
+def markings_only(outcome: FrameEvaluation) -> FrameEvaluation:
+    """Returns the same frame without labeled and reported edges of the road."""
+    lanes = tuple(lane for lane in outcome.frame.lanes if lane.kind != "road_edge")
+    reports = tuple(report for report in outcome.reports if report.kind == "marking")
+    return FrameEvaluation(replace(outcome.frame, lanes=lanes), reports)
+
+
+def judge(proposals: Proposals, classification: Classification, frame: LabeledFrame) -> JudgedCandidates:
     """Judges up to 32 candidates against the labels of `frame`, all in pixels of the working image.
 
-    `outputs` (M, 2) are the classifier's for the first M, which are those that it sees in service.
+    `classification` is the classifier's of the first M, which are those that it sees in service.
     """
-    seen = np.arange(len(outputs))
+    seen = np.arange(len(classification.kinds))
     served = replace(proposals, curves=proposals.curves.take(seen), spans=proposals.spans.take(seen))
     verdicts = {name: rule.judge(served.curves, served.spans, served.view, frame) for name, rule in RULES.items()}
     ego, rule = ego_sides(frame), RULES["far_40"]
@@ -70,5 +78,5 @@ def judge(proposals: Proposals, outputs: NDArray[np.float32], frame: LabeledFram
         true = rule.follows(proposals.curves, proposals.spans, proposals.view, lane, frame.width)
         rank = int(true.argmax()) if true.any() else None
         proposed.append(LabelProposal(any(lane is side for side in ego), rank))
-    own, decided = outputs[:, BOUNDARY].astype(np.float64), CandidateDetector.probabilities(served, outputs)
-    return JudgedCandidates(own, decided, verdicts, tuple(proposed))
+    decided = CandidateDetector.with_prior(served, classification)
+    return JudgedCandidates(classification.boundary, decided.boundary, verdicts, tuple(proposed))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import matplotlib as mpl
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
@@ -18,19 +16,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from sklearn.metrics import ConfusionMatrixDisplay, PrecisionRecallDisplay
 
-from lanestream.road.curve import FloatArray
-from lanestream.road.view import Image
 from lanestream_exporter.evaluation.bootstrap import SPAN, STILLS
-from lanestream_exporter.evaluation.boundaries import match_ego
 from lanestream_exporter.evaluation.candidates import clear_candidates
-from lanestream_exporter.evaluation.figures import match_all
-from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, by_drive
+from lanestream_exporter.evaluation.gallery import STYLES, gallery
+from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, by_drive
 from lanestream_exporter.evaluation.outcomes import RULES, FrameEvaluation
+from lanestream_exporter.evaluation.verdicts import HIGH_BASE_RATE, says_little
 
 CHART_RULE = "far_40"
-GALLERY_FRAMES = 24
-_GALLERY_WIDTH = 480
-_LABEL_COLOR, _EGO_COLOR, _OTHER_COLOR = (80, 220, 80), (60, 60, 255), (255, 160, 40)  # blue, green, red
 
 
 def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any]) -> Path:
@@ -43,12 +36,15 @@ def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any
     )
     environment.filters["share"] = _share
     environment.filters["interval"] = _interval
+    environment.filters["mark"] = lambda base_rate: "*" if says_little(base_rate) else ""
     first = evaluation.methods[0]
     page = environment.get_template("report.html.jinja").render(
         figures=figures,
         rules=list(RULES),
         block={"stills": STILLS, "span": SPAN},
         charts=charts(evaluation, figures),
+        high_base_rate=HIGH_BASE_RATE,
+        styles=STYLES,
         gallery_method=first.name,
         gallery=gallery(evaluation.evaluation_set, evaluation.images[first.name]),
     )
@@ -156,54 +152,3 @@ def _chart(caption: str, draw: Callable[[Axes], None]) -> Chart:
     prefix = re.sub(r"\W+", "-", caption) + "-"
     svg = re.sub(r'(id="|href="#|url\(#)', lambda match: match.group(1) + prefix, buffer.getvalue())
     return Chart(caption, svg[svg.index("<svg") :])
-
-
-@dataclass(frozen=True)
-class GalleryImage:
-    """One frame of the gallery: a JPEG as a data URL, and a caption with its mistakes."""
-
-    caption: str
-    url: str = field(repr=False)
-
-
-def gallery(dataset: EvaluationSet, outcomes: Sequence[FrameEvaluation]) -> list[GalleryImage]:
-    """Draws the worst frames, worst first. Reads the images again, so that the evaluation need not keep them."""
-    worst = sorted(range(len(outcomes)), key=lambda i: _badness(outcomes[i]), reverse=True)[:GALLERY_FRAMES]
-    rank_of = {index: rank for rank, index in enumerate(worst)}
-    images: dict[int, GalleryImage] = {}
-    for index, (_, image) in enumerate(dataset.images()):
-        if index in rank_of:
-            images[rank_of[index]] = _gallery_image(image, outcomes[index])
-    return [images[rank] for rank in sorted(images)]
-
-
-def _badness(outcome: FrameEvaluation) -> tuple[int, int, float]:
-    """Returns a sort key: mistakes of the ego pair, then of all boundaries, then the mean error."""
-    ego, every = match_ego(outcome.reports, outcome.frame), match_all(outcome)
-    error = float(np.mean([match.error for match in every.matches])) if every.matches else 0.0
-    return ego.missed + ego.wrong, every.missed + every.wrong, error
-
-
-def _gallery_image(image: Image, outcome: FrameEvaluation) -> GalleryImage:
-    frame = outcome.frame
-    scale = _GALLERY_WIDTH / frame.width
-    size = _GALLERY_WIDTH, round(frame.height * scale)
-    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    for lane in frame.lanes:
-        _draw_line(small, lane.points * scale, _LABEL_COLOR, 2)
-    for report in outcome.reports:
-        rows = np.linspace(report.top, report.bottom, 32)
-        points = np.stack([report.curve.x(rows), rows], axis=1) * scale
-        _draw_line(small, points, _EGO_COLOR if report.position in (-1, 1) else _OTHER_COLOR, 1)
-    ego, every = match_ego(outcome.reports, frame), match_all(outcome)
-    caption = (
-        f"{frame.group}, {frame.source}: ego {len(ego.matches)} right, {ego.wrong} wrong, {ego.missed} missed; "
-        f"all {len(every.matches)} right, {every.wrong} wrong, {every.missed} missed"
-    )
-    encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
-    return GalleryImage(caption, "data:image/jpeg;base64," + base64.b64encode(encoded).decode())
-
-
-def _draw_line(image: Image, points: FloatArray, color: tuple[int, int, int], thickness: int) -> None:
-    path = np.round(np.clip(points, -1e4, 1e4)).astype(np.int32)
-    cv2.polylines(image, [path], isClosed=False, color=color, thickness=thickness, lineType=cv2.LINE_AA)

@@ -100,4 +100,4 @@ def _read_messages(path: Path) -> list[LanesMessage]:
 
 def _report(lane: LaneModel) -> ReportedBoundary:
     curve = Curve(lane.horizon, lane.coefficients)
-    return ReportedBoundary(curve, lane.line.top[1], lane.line.bottom[1], lane.position)
+    return ReportedBoundary(curve, lane.line.top[1], lane.line.bottom[1], lane.position, kind=lane.kind)

@@ -9,19 +9,31 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from lanestream_exporter.evaluation.verdicts import HIGH_BASE_RATE, says_little
+
 # Returns the cells of a row from a method's figure groups for a drive; an empty list if it has no such figures.
-RowCells = Callable[[Mapping[str, Any]], list[float | None]]
+RowCells = Callable[[Mapping[str, Any]], list[float | str | None]]
 
 _LATERAL = ("10 m", "ratio", "30 m", "ratio", "straight ratio")
 _BENCHMARKS = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
 _CANDIDATES = ("base rate", "P", "R", "Acc", "AP")
 _DECISIONS = (*_CANDIDATES, "ego prop.", "all prop.")
-_BOUNDARIES = ("ego P", "ego R", "ego F1", "px", "all P", "all R", "all F1")
+_BOUNDARIES = ("frames", "right", "wrong", "missed", "ego base", "ego P", "ego R", "px", "all P", "all R", "all F1")
+_KINDS = ("marked", "of", "edge P", "edge R", "type", "of", "constant", "color", "of", "constant")
+_KINDS_TITLE = "Frames without markings in which one is reported, edges of the road, types and colors"
+_LITTLE = f"* says little: more than {HIGH_BASE_RATE:.0%} of what is judged are boundaries (base rate)"
 
 
 def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     """Yields the tables of each level, with a section per drive and a row per method."""
     images, clips = figures["images"], figures["clips"]
+    for title, parts in (("data set", figures["datasets"]), ("condition", figures["conditions"])):
+        if any(parts.values()):
+            yield _table(f"Boundaries by {title}, single images", _BOUNDARIES, parts, _on_images)
+            yield _table(f"{_KINDS_TITLE}, by {title}", _KINDS, parts, lambda groups: _kinds(groups["kinds"]))
+    yield _table(f"{_KINDS_TITLE}, single images", _KINDS, images, lambda groups: _kinds(groups["kinds"]))
+    if any(clips.values()):
+        yield _table(f"{_KINDS_TITLE}, clips with the tracker", _KINDS, clips, _tracked_kinds)
     yield _table("A. Candidates, by the classifier's probability: false beyond 40 px", _CANDIDATES, images, _candidates)
     yield _table("A. Candidates, by the detector's decision, and proposal recall with 16", _DECISIONS, images, _decided)
     yield _table("B. Single images: boundaries, error in px at 640 wide", _BOUNDARIES, images, _on_images)
@@ -37,44 +49,67 @@ def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     )
 
 
-def _candidates(groups: Mapping[str, Any]) -> list[float | None]:
+def _tracked_kinds(groups: Mapping[str, Any]) -> list[float | str | None]:
+    return _kinds(groups["kinds"]["tracked"])
+
+
+def _kinds(kinds: Mapping[str, Any]) -> list[float | str | None]:
+    unmarked, edges = kinds["false_markings"]["unmarked"], kinds["road_edges"]
+    if not any((unmarked["frames"], edges["frames"], kinds["types"]["markings"], kinds["colors"]["markings"])):
+        return []
+    cells = [unmarked["with_marking"], unmarked["frames"], edges["precision"], edges["recall"]]
+    for part in (kinds["types"], kinds["colors"]):
+        cells += [part["right_share"], part["markings"], part["constant_share"]]
+    return cells
+
+
+def _candidates(groups: Mapping[str, Any]) -> list[float | str | None]:
     if "candidates" not in groups:
         return []
     return _shares(groups["candidates"]["far_40"])
 
 
-def _decided(groups: Mapping[str, Any]) -> list[float | None]:
+def _decided(groups: Mapping[str, Any]) -> list[float | str | None]:
     if "candidates" not in groups:
         return []
     part, proposed = groups["candidates"]["decided"]["far_40"], groups["candidates"]["proposal_recall"]
     return [*_shares(part), *(proposed[which]["recall_16"] for which in ("ego", "all"))]
 
 
-def _shares(part: Mapping[str, Any]) -> list[float | None]:
-    return [part[key] for key in ("base_rate", "precision", "recall", "accuracy", "average_precision")]
+def _shares(part: Mapping[str, Any]) -> list[float | str | None]:
+    rest = (part[key] for key in ("recall", "accuracy", "average_precision"))
+    return [part["base_rate"], _precision(part), *rest]
 
 
-def _on_images(groups: Mapping[str, Any]) -> list[float | None]:
+def _on_images(groups: Mapping[str, Any]) -> list[float | str | None]:
     return _boundaries(groups["boundaries"])
 
 
-def _boundaries(part: Mapping[str, Any]) -> list[float | None]:
-    pair = [part["ego"][key] for key in ("precision", "recall", "f1", "mean_error_px_640")]
-    return [*pair, *(part["all"][key] for key in ("precision", "recall", "f1"))]
+def _boundaries(part: Mapping[str, Any]) -> list[float | str | None]:
+    ego = part["ego"]
+    counts = [ego[key] for key in ("frames", "right", "wrong", "missed", "base_rate")]
+    rates = [_precision(ego), ego["recall"], ego["mean_error_px_640"]]
+    return [*counts, *rates, *(part["all"][key] for key in ("precision", "recall", "f1"))]
 
 
-def _lateral(groups: Mapping[str, Any]) -> list[float | None]:
+def _precision(part: Mapping[str, Any]) -> str:
+    """Returns a precision, marked if its base rate makes it say little."""
+    is_marked = part["precision"] is not None and says_little(part["base_rate"])
+    return _cell(part["precision"]) + ("*" if is_marked else "")
+
+
+def _lateral(groups: Mapping[str, Any]) -> list[float | str | None]:
     near, far = groups["lateral"]["10m"], groups["lateral"]["30m"]
     return [near["mean_px_640"], near["ratio"], far["mean_px_640"], far["ratio"], far["straight_ratio"]]
 
 
-def _field(part: Mapping[str, Any]) -> list[float | None]:
+def _field(part: Mapping[str, Any]) -> list[float | str | None]:
     tusimple, culane = part["tusimple"], part["culane"]
     return [tusimple["accuracy"], tusimple["fp"], tusimple["fn"], culane["f1"]]
 
 
 def _table(title: str, columns: Sequence[str], methods: Mapping[str, Any], cells: RowCells) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("")
     for column in columns:
         table.add_column(column, justify="right")
@@ -84,9 +119,13 @@ def _table(title: str, columns: Sequence[str], methods: Mapping[str, Any], cells
             table.add_row(Text(drive, style="bold"))
         for method, row in rows:
             if row:
-                table.add_row(Text(f" {method}"), *map(_share, row))
+                table.add_row(Text(f" {method}"), *map(_cell, row))
+                if any(isinstance(cell, str) and cell.endswith("*") for cell in row):
+                    table.caption = _LITTLE
     return table
 
 
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+def _cell(value: float | str | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)

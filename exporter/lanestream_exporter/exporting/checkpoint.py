@@ -12,19 +12,18 @@ from pydantic import ValidationError
 from torch import Tensor, nn
 
 from lanestream.errors import CheckpointError
+from lanestream.road.appearance import BOUNDARY_KINDS
 from lanestream.road.crops import PatchGeometry
-from lanestream_exporter.alexnet import FULL, AlexNet, Shape, load_state
+from lanestream_exporter.alexnet import FULL, OUTPUTS, AlexNet, Shape
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.exportable import ExportableNetwork
 from lanestream_exporter.exporting.regressor import ExportableRegressor
 from lanestream_exporter.regressor import LaneRegressor
 from lanestream_exporter.training.config import NetworkSize
+from lanestream_exporter.weight_files import load_state, weights_in
 
 _LANE: Final = "lane"
 _LAST_LAYER: Final = "classifier.6.weight"
-
-# Keys under which other trainers store the weights.
-_WRAPPER_KEYS: Final = ("model", "state_dict", "model_state_dict")
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,10 @@ def _read_own(path: Path, state: Mapping[str, Any]) -> ExportableNetwork:
         regressor = LaneRegressor(shape, batch_norm=_has_norms(weights))
         _load_weights(path, regressor, weights)
         return ExportableRegressor(regressor.eval().folded())
-    return ExportableClassifier(_load_alexnet(path, weights, shape), patch_geometry=PatchGeometry(shape.size))
+    network = _load_alexnet(path, weights, shape)
+    # Runs before 0.13 have two classes.
+    classes = ("nothing", *BOUNDARY_KINDS) if network.outputs == OUTPUTS else ("false", _LANE)
+    return ExportableClassifier(network, classes, PatchGeometry(shape.size))
 
 
 def _recorded_shape(path: Path, state: Mapping[str, Any]) -> Shape:
@@ -103,11 +105,12 @@ def _load_alexnet(path: Path, weights: Mapping[str, Tensor], shape: Shape) -> Al
     last = weights.get(_LAST_LAYER)
     if not isinstance(last, Tensor) or last.ndim != 2:
         raise CheckpointError(f"{path} is not an AlexNet: {_LAST_LAYER} is missing", "use torchvision's key names")
-    if len(last) != 2:
+    if len(last) not in (2, OUTPUTS):
         raise CheckpointError(
-            f"{path} has {len(last)} classes, but the service needs two", "fine-tune it with a final layer of 2"
+            f"{path} has {len(last)} outputs, but the service needs {OUTPUTS}, or 2 of a network from elsewhere",
+            "train it with `lanestream train classifier`, or fine-tune it with a final layer of 2",
         )
-    network = AlexNet(shape=shape, batch_norm=_has_norms(weights))
+    network = AlexNet(len(last), shape, batch_norm=_has_norms(weights))
     _load_weights(path, network, weights)
     return network.eval().folded()
 
@@ -130,9 +133,8 @@ def _load_weights(path: Path, network: nn.Module, weights: Mapping[str, Tensor])
 
 
 def _unwrap(path: Path, state: Mapping[str, Any]) -> Mapping[str, Tensor]:
-    """Returns the bare weights, without a wrapping key and without the prefix of DataParallel."""
-    inner = next((state[key] for key in _WRAPPER_KEYS if isinstance(state.get(key), Mapping)), state)
-    weights = {str(key).removeprefix("module."): value for key, value in inner.items() if isinstance(value, Tensor)}
+    """Returns the bare weights, wherever a trainer stored them. Raises CheckpointError if there are none."""
+    weights = weights_in(state)
     if not weights:
         raise CheckpointError(f"{path} has no weights", "save the state_dict of the network")
     return weights

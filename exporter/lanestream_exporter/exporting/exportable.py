@@ -26,10 +26,15 @@ RunNetwork = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Calibration:
-    """The `temperature` that logits are divided by, and the probability `threshold` for accepting a boundary."""
+    """The `temperature` that logits are divided by, and the probability `threshold` for accepting a boundary.
+
+    The logits of types and colors of markings have their own temperatures.
+    """
 
     temperature: float = 1.0
     threshold: float = 0.5
+    type_temperature: float = 1.0
+    color_temperature: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -122,21 +127,31 @@ class ExportableNetwork(Protocol):
 
 
 def fit_calibration(logits: NDArray[np.float32], labels: NDArray[np.int64]) -> Calibration:
-    """Returns the temperature of least log loss and the threshold for the best F1, for logits (N, 2), labels (N,).
+    """Returns the temperature of least log loss and the threshold for the best F1 of accepting all but class 0.
 
-    Returns the default if all labels are equal. Source of temperature scaling: C. Guo et al., "On calibration of modern
-    neural networks", 2017.
+    `logits` are (N, classes), `labels` (N,). Returns the default if all labels are equal.
     """
+    temperature = fit_temperature(logits, labels)
     if len(np.unique(labels)) < 2:
         return Calibration()
+    probability = 1.0 - softmax(logits / temperature, axis=1)[:, 0]
+    return Calibration(temperature, _threshold(probability, (labels > 0).astype(np.int64)))
+
+
+def fit_temperature(logits: NDArray[np.float32], labels: NDArray[np.int64]) -> float:
+    """Returns the temperature of least log loss for logits (N, classes) and labels (N,); 1 if all labels are equal.
+
+    Source: C. Guo et al., "On calibration of modern neural networks", 2017.
+    """
+    if len(np.unique(labels)) < 2:
+        return 1.0
     rows = np.arange(len(labels))
 
     def log_loss(log_temperature: float) -> float:
         return float(-log_softmax(logits / np.exp(log_temperature), axis=1)[rows, labels].mean())
 
     best = minimize_scalar(log_loss, bounds=(np.log(0.25), np.log(8.0)), method="bounded")
-    temperature = float(np.exp(best.x))
-    return Calibration(temperature, _threshold(softmax(logits / temperature, axis=1)[:, 1], labels))
+    return float(np.exp(best.x))
 
 
 def _threshold(probability: NDArray[np.float64], labels: NDArray[np.int64]) -> float:

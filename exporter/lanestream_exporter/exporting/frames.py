@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, Literal, TypeVar
 
@@ -38,12 +38,12 @@ class LabeledJpeg:
 class ExportFrames:
     """Rendered frames, `rendered` per part, and labeled real frames of `datasets`, if given.
 
-    At most `real` real frames per part are used, evenly spaced among all.
+    At most `real` frames per part and data set are used, evenly spaced among all, so that no data set dominates.
     """
 
     datasets: DatasetCollection | None
     rendered: int = 48
-    real: int = 96
+    real: int = 24
 
     @property
     def origin(self) -> str:
@@ -56,12 +56,12 @@ class ExportFrames:
         """Returns full frames of `part` as JPEG files. Raises LabelError for unreadable real frames."""
         rendered = [LabeledJpeg(_encode(image), labels) for labels, image, _ in self._rendered(part)]
         real = [LabeledJpeg(_encode(image), labels) for labels, image in self._real(part)]
-        return [*_evenly_spaced(real, self.real), *rendered]
+        return [*_evenly_spaced(real, self.real, lambda frame: frame.labels.dataset), *rendered]
 
     def road_frames(self, part: Part) -> list[RoadFrame]:
         """Returns downscaled frames of `part` with known horizons. Raises LabelError for unreadable real frames."""
         rendered = [RoadFrame.of(labels, image, horizon) for labels, image, horizon in self._rendered(part)]
-        real = _evenly_spaced(road_frames(self._real(part)), self.real)
+        real = _evenly_spaced(road_frames(self._real(part)), self.real, lambda frame: frame.dataset)
         return [*real, *(frame for frame in rendered if frame is not None)]
 
     def _real(self, part: Part) -> LabeledImages:
@@ -74,8 +74,16 @@ class ExportFrames:
             yield still.labels, still.image, still.horizon
 
 
-def _evenly_spaced(items: list[T], limit: int) -> list[T]:
-    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(limit, len(items))).astype(int))]
+def _evenly_spaced(items: list[T], limit: int, dataset_of: Callable[[T], str]) -> list[T]:
+    """Returns at most `limit` items of each data set, evenly spaced."""
+    sets: dict[str, list[T]] = {}
+    for item in items:
+        sets.setdefault(dataset_of(item), []).append(item)
+    return [
+        part[i]
+        for part in sets.values()
+        for i in np.unique(np.linspace(0, len(part) - 1, min(limit, len(part))).astype(int))
+    ]
 
 
 def _encode(image: Image) -> bytes:

@@ -19,6 +19,7 @@ from lanestream.detection.interface import FrameContext, Infer, ModelRole
 from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.images.decoding import ImageLimits, decode
 from lanestream.inference.model_info import RegressorInfo
+from lanestream.road.appearance import BOUNDARY_KINDS
 from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.exporting.compression import in_batches, run_in_pytorch, truncate_layers
@@ -48,7 +49,7 @@ _MAX_ERROR: Final = 5.0
 
 
 class ServedRegressor(nn.Module):
-    """The module to export: uint8 RGB road crops (N, H, W, 3) in, the layout of `RegressorOutput` (N, 15) out."""
+    """The module to export: uint8 RGB road crops (N, H, W, 3) in, the layout of `RegressorOutput` (N, 17) out."""
 
     def __init__(self, network: LaneRegressor, temperature: float, half: bool = False) -> None:
         super().__init__()
@@ -119,9 +120,9 @@ class ExportableRegressor:
             for horizon in (frame.horizon, None):
                 images.append(image)
                 contexts.append(FrameContext(horizon))
-                targets.append((target.columns, target.known, target.presence, frame.horizon))
+                targets.append((target.columns, target.known, target.presence, target.road_edge, frame.horizon))
                 self.detector.regressor.predict(image, horizon, record)
-        names = ("columns", "known", "presence", "horizon")
+        names = ("columns", "known", "presence", "road_edge", "horizon")
         truth = {name: np.array(values) for name, values in zip(names, zip(*targets, strict=True), strict=True)}
         return ValidationSet(len(road_frames), tuple(images), tuple(contexts), np.concatenate(inputs), truth)
 
@@ -150,16 +151,19 @@ class ExportableRegressor:
         return ServedRegressor(self.network, self.calibration.temperature, half).eval()
 
     def metrics(self, run: RunNetwork, validation: ValidationSet) -> MetricValues:
-        """Returns the shares of right columns and presences, and mean lateral errors in pixels at 640 wide."""
-        columns, presence = self._read(run, validation)
+        """Returns the shares of right columns, presences and kinds, and mean lateral errors in pixels at 640 wide."""
+        columns, presence, road_edge = self._read(run, validation)
         error = _REFERENCE_WIDTH * np.abs(columns - validation.truth["columns"])
         labeled = validation.truth["known"] >= 1.0
         true_presence = validation.truth["presence"]
         defined = true_presence >= 0.0
         accepted = presence >= self.calibration.threshold
+        true_edge = validation.truth["road_edge"]
+        known = true_edge >= 0.0
         return {
             "accuracy": _mean(error[labeled] <= _MAX_ERROR),
             "presence_accuracy": _mean((accepted == (true_presence > 0.0))[defined]),
+            "kind_accuracy": _mean(((road_edge > 0.5) == (true_edge > 0.5))[known]),
             "error_near_px": _mean(error[:, :, _NEAR][labeled[:, :, _NEAR]]),
             "error_far_px": _mean(error[:, :, _FAR][labeled[:, :, _FAR]]),
         }
@@ -170,6 +174,7 @@ class ExportableRegressor:
             kind="regressor",
             name=description.name,
             version=__version__,
+            kinds=BOUNDARY_KINDS,
             road_crop=self._geometry,
             threshold=self.calibration.threshold,
             precision=description.precision,
@@ -178,19 +183,21 @@ class ExportableRegressor:
             exporter=exporter_versions(),
         )
 
-    def _read(self, run: RunNetwork, validation: ValidationSet) -> tuple[FloatArray, FloatArray]:
+    def _read(self, run: RunNetwork, validation: ValidationSet) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Returns what the detector reads from the outputs of `run` for P validation images.
 
-        Columns (P, 2, S) at `SHARES` of the true row offset, in image widths from the center; presence (P, 2).
+        Columns (P, 2, S) at `SHARES` of the true row offset, in image widths from the center; presence and road_edge
+        (P, 2).
         """
-        columns, presence = [], []
+        columns, presence, road_edge = [], [], []
         frames = zip(validation.images, validation.contexts, validation.truth["horizon"], strict=True)
         for image, context, horizon in frames:
             output, view = self.detector.regressor.predict(image, context.horizon, self.infer(run))
             rows = horizon + np.array(SHARES) * (view.bottom - horizon)
             columns.append((output.curves(view).x(rows) - view.middle) / view.width)
             presence.append(output.presence)
-        return np.array(columns), np.array(presence)
+            road_edge.append(output.road_edge)
+        return np.array(columns), np.array(presence), np.array(road_edge)
 
 
 def _warps(frame: RoadFrame, rng: np.random.Generator) -> Iterator[Warp]:

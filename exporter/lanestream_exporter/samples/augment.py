@@ -48,10 +48,10 @@ class Augmentation(Section):
 
 
 def augmented(
-    patches: NDArray[np.uint8], labels: NDArray[np.int64], shares: Augmentation, rng: np.random.Generator
+    patches: NDArray[np.uint8], is_boundary: NDArray[np.bool_], shares: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns RGB patches (N, H, W, 3), each varied on its own so that its label (N,) stays true."""
-    moved = (_move(patch, bool(label), shares, rng) for patch, label in zip(patches, labels, strict=True))
+    """Returns RGB patches (N, H, W, 3), each varied on its own so that it still shows a boundary (N,) or not."""
+    moved = (_move(patch, shows, shares, rng) for patch, shows in zip(patches, is_boundary.tolist(), strict=True))
     return np.stack([corrupted(patch, shares.corruptions, rng) for patch in moved])
 
 

@@ -14,7 +14,13 @@ SCENES_PER_FILE = 250
 
 # The version of rendering, of candidates and of labeling. It is part of the file names, so that files of another
 # version are not used.
-SAMPLES_VERSION = 4
+SAMPLES_VERSION = 5
+
+# Hard scenes are seeded by file numbers from here on, which no file of other scenes reaches.
+FIRST_HARD_FILE = 1_000_000
+
+# The name of the data set of pictures without a road.
+NO_ROAD = "pictures without a road"
 
 # Called with a file's number, its number of scenes and its path; writes the file.
 WriteScenes = Callable[[int, int, Path], object]
@@ -29,7 +35,7 @@ def scenes_per_file(scenes: int) -> list[int]:
 def scene_files(
     folder: Path, kind: str, scenes: Sequence[int], write: WriteScenes, workers: int, done: Callable[[int], None]
 ) -> list[Path]:
-    """Returns files named by `kind` and the samples' version, the n-th with `scenes[n]` scenes; writes missing ones.
+    """Returns files named by `kind` and the samples' version, the n-th from `scenes[n]` scenes; writes missing ones.
 
     `write` must be a module-level function, because other processes call it. `done` is called with the number of scenes
     of each file when it is finished.

@@ -38,12 +38,14 @@ class RegressionTarget:
 
     `columns` (2, S) are those of the left and the right boundary at `SHARES` of the rows below the true horizon, in
     image widths from the center; `known` (2, S) weighs them, 1 within a label; `presence` (2,) is 1, 0, or -1 if
-    unknown; `horizon` is its offset below the assumed horizon, as a share of the rows below that.
+    unknown; `road_edge` (2,) is 1 for an edge of the road, 0 for a marking, -1 if unknown or absent; `horizon` is its
+    offset below the assumed horizon, as a share of the rows below that, or NaN without a road.
     """
 
     columns: NDArray[np.float32]
     known: NDArray[np.float32]
     presence: NDArray[np.float32]
+    road_edge: NDArray[np.float32]
     horizon: float
 
 
@@ -125,19 +127,25 @@ def _warped(lane: FloatArray, view: RoadView, warp: Warp) -> FloatArray:
 def _target(lanes: list[FloatArray], frame: RoadFrame, view: RoadView, assumed: RoadView) -> RegressionTarget:
     rows = view.horizon + np.asarray(SHARES) * view.depth
     center = (frame.width - 1) / 2.0
-    sampled = [_at(lane, rows, view) for lane in lanes if len(lane) >= 3]
+    usable = [(lane, kind) for lane, kind in zip(lanes, frame.kinds, strict=True) if len(lane) >= 3]
+    sampled = [_at(lane, rows, view) for lane, _ in usable]
     columns = np.zeros((2, len(SHARES)), np.float32)
     known = np.zeros((2, len(SHARES)), np.float32)
     presence = np.full(2, 0.0 if frame.exhaustive else -1.0, np.float32)
+    road_edge = np.full(2, -1.0, np.float32)
     for side, sign in ((0, -1.0), (1, 1.0)):
         candidates = [
             (sign * (x[0] - center), index) for index, (x, _) in enumerate(sampled) if sign * (x[0] - center) > 0.0
         ]
         if candidates:
-            x, weight = sampled[min(candidates)[1]]
+            nearest = min(candidates)[1]
+            x, weight = sampled[nearest]
             columns[side], known[side] = (x - center) / frame.width, weight
             presence[side] = 1.0
-    return RegressionTarget(columns, known, presence, (view.horizon - assumed.horizon) / assumed.depth)
+            kind = usable[nearest][1]
+            road_edge[side] = -1.0 if kind is None else float(kind == "road_edge")
+    horizon = (view.horizon - assumed.horizon) / assumed.depth if frame.has_road else np.nan
+    return RegressionTarget(columns, known, presence, road_edge, horizon)
 
 
 def _at(lane: FloatArray, rows: FloatArray, view: RoadView) -> tuple[FloatArray, FloatArray]:

@@ -4,9 +4,12 @@ A scene is one frozen value: `scene.py` samples it at random and `render.py` tur
 on the ground is a function of road coordinates: s meters along the road and u meters to the left of its reference line.
 `projection.py` maps every pixel to (s, u) once per frame, so that paint, wear and shadows move with the road. Labels
 come from the inverse of the same mapping. `tracking_clips.py` samples clips for measuring trackers.
+
+`no_road.py` makes pictures in which a detector must find nothing.
 """
 
 from lanestream_exporter.scenes.clip import Clip, Drive, render_clip, sample_clip, write_clip
+from lanestream_exporter.scenes.no_road import sample_picture
 from lanestream_exporter.scenes.render import RenderedFrame, render_still
 from lanestream_exporter.scenes.scene import Scene, sample_scene
 
@@ -18,6 +21,7 @@ __all__ = [
     "render_clip",
     "render_still",
     "sample_clip",
+    "sample_picture",
     "sample_scene",
     "write_clip",
 ]

@@ -39,6 +39,8 @@ SPEEDS: dict[RoadStyle, tuple[float, float]] = {  # meters per second
     "country": (13.0, 22.0),
     "street": (7.0, 13.0),
     "lane": (7.0, 13.0),
+    "campus": (4.0, 9.0),
+    "square": (3.0, 7.0),
 }
 FAIR_CLOUDS = 0.35  # largest share of the sky on a fair day
 MIN_GAP = 6.0  # meters between our vehicle and others
@@ -180,7 +182,7 @@ def label_record(labels: LabeledFrame, clip: str, frame: int) -> dict[str, Any]:
             {
                 "id": lane.lane_id,
                 "position": lane.position,
-                "type": lane.kind,
+                "type": lane.type,
                 "color": lane.color,
                 "points": lane.points.round(1).tolist(),
             }

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-from lanestream_exporter.scenes.road import Boundary, Marking, MarkingKind, PaintColor, Stripe
+from lanestream_exporter.scenes.road import Boundary, EdgeType, Marking, Stripe
 
 if TYPE_CHECKING:
+    from lanestream.road.appearance import MarkingColor, MarkingType
     from lanestream_exporter.scenes.random_sampler import RandomSampler
 
-RoadStyle = Literal["highway", "country", "street", "lane"]
+RoadStyle = Literal["highway", "country", "street", "lane", "campus", "square"]
 
 # (period, dash length) in meters, as painted in different countries and cities.
 DASHES = (
@@ -25,21 +26,35 @@ DASHES = (
     (4.0, 2.0),
 )
 
-# How often each kind of marking is used, by its place on the road.
-LANE_DIVIDER: dict[MarkingKind, float] = {"dashed": 0.65, "botts": 0.32, "solid": 0.03}
-MEDIAN: dict[MarkingKind, float] = {"solid": 0.93, "double": 0.07}
-AMERICAN_CENTER: dict[MarkingKind, float] = {"double": 0.6, "dashed": 0.25, "solid": 0.15}
-EUROPEAN_CENTER: dict[MarkingKind, float] = {"dashed": 0.6, "solid": 0.3, "double": 0.1}
-STREET_CENTER: dict[MarkingKind, float] = {"double": 0.5, "solid": 0.25, "dashed": 0.25}
-ROAD_SIDE: dict[MarkingKind | None, float] = {"solid": 0.72, None: 0.2, "dashed": 0.08}
+# How often each type of marking is used, by its place on the road.
+LANE_DIVIDER: dict[MarkingType, float] = {"dashed": 0.65, "dots": 0.32, "solid": 0.03}
+MEDIAN: dict[MarkingType, float] = {"solid": 0.93, "double": 0.07}
+AMERICAN_CENTER: dict[MarkingType, float] = {"double": 0.6, "dashed": 0.25, "solid": 0.15}
+EUROPEAN_CENTER: dict[MarkingType, float] = {"dashed": 0.6, "solid": 0.3, "double": 0.1}
+STREET_CENTER: dict[MarkingType, float] = {"double": 0.5, "solid": 0.25, "dashed": 0.25}
+ROAD_SIDE: dict[MarkingType | None, float] = {"solid": 0.72, None: 0.2, "dashed": 0.08}
 BROKEN_STRIPE: dict[Stripe, float] = {"neither": 0.75, "left": 0.13, "right": 0.12}
-PAINT_COLORS: tuple[PaintColor, ...] = ("yellow", "white")
-MIXED_DIVIDER_SHARE = 0.08  # share of highways whose lane dividers are of several kinds
+PAINT_COLORS: tuple[MarkingColor, ...] = ("yellow", "white")
+MIXED_DIVIDER_SHARE = 0.08  # share of highways whose lane dividers are of several types
+FADED_SHARE: Final = 0.15  # share of roads whose yellow paint has become pale
+
+KERB_SHARES: dict[RoadStyle, float] = {  # how often the edges of a road are kerbs
+    "highway": 0.05,
+    "country": 0.06,
+    "street": 0.92,
+    "lane": 0.2,
+    "campus": 0.7,
+    "square": 0.0,
+}
+PAVED_REACH: Final = 70.0  # how far pavement without an edge extends to the side, meters
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A road's cross-section. Lateral positions u in meters, left positive; the center of the ego lane is u = 0."""
+    """A road's cross-section. Lateral positions u in meters, left positive; the center of the ego lane is u = 0.
+
+    `boundaries` are in order from left to right. They include the edges of the pavement, whose types `edges` repeats.
+    """
 
     style: RoadStyle
     boundaries: tuple[Boundary, ...]
@@ -50,6 +65,17 @@ class Layout:
     concrete: bool
     tone: float  # brightness of the driving surface
     opposite: float = 0.0  # another roadway beyond the left edge (+1) or the right edge (-1); 0 for neither
+    edges: tuple[EdgeType | None, EdgeType | None] = (None, None)  # right and left; None where the pavement goes on
+
+    @property
+    def markings(self) -> tuple[Boundary, ...]:
+        """Returns the boundaries that are painted."""
+        return tuple(boundary for boundary in self.boundaries if boundary.marking)
+
+    @property
+    def roadside(self) -> tuple[float, float]:
+        """Returns where trees, posts and houses may begin on the right and the left: at the edges, or on a square."""
+        return max(self.paved[0], -18.0), min(self.paved[1], 18.0)
 
     def mirrored(self) -> Layout:
         """Returns the same road for left-hand traffic."""
@@ -58,7 +84,7 @@ class Layout:
             marking = boundary.marking
             if marking and marking.broken != "neither":
                 marking = replace(marking, broken="right" if marking.broken == "left" else "left")
-            flipped.append(Boundary(-boundary.u, marking))
+            flipped.append(replace(boundary, u=-boundary.u, marking=marking))
         return replace(
             self,
             boundaries=tuple(flipped),
@@ -66,7 +92,18 @@ class Layout:
             oncoming=tuple(-u for u in self.oncoming),
             paved=(-self.paved[1], -self.paved[0]),
             opposite=-self.opposite,
+            edges=(self.edges[1], self.edges[0]),
         )
+
+    def with_edges(self, right: EdgeType | None, left: EdgeType | None) -> Layout:
+        """Returns the same road with edges of these types at the limits of the pavement; without one it goes on."""
+        paved = (self.paved[0] if right else -PAVED_REACH, self.paved[1] if left else PAVED_REACH)
+        boundaries = self.boundaries
+        if left:
+            boundaries = (Boundary(paved[1], None, edge=left), *boundaries)
+        if right:
+            boundaries = (*boundaries, Boundary(paved[0], None, edge=right))
+        return replace(self, boundaries=boundaries, paved=paved, edges=(right, left))
 
 
 @dataclass(frozen=True)
@@ -93,11 +130,11 @@ class _Painter:
             sampler, tone, period, dash, sampler.uniform(0.0, period), wear, brightness, sampler.uniform(0.1, 0.2)
         )
 
-    def line(self, kind: MarkingKind, color: PaintColor) -> Marking:
-        """Returns a marking of this kind, slightly different from the road's other markings."""
+    def line(self, type_: MarkingType, color: MarkingColor) -> Marking:
+        """Returns a marking of this type, slightly different from the road's other markings."""
         sampler = self.sampler
         common = Marking(
-            kind=kind,
+            type=type_,
             color=color,
             width=min(0.3, self.width * sampler.uniform(0.9, 1.4)),
             brightness=min(0.98, max(self.tone + 0.07, self.brightness + sampler.normal(0.04))),
@@ -108,9 +145,9 @@ class _Painter:
             gap=sampler.uniform(0.09, 0.2),
             seed=sampler.seed(),
         )
-        if kind == "botts":
+        if type_ == "dots":
             return self._dots(common)
-        if kind == "double":
+        if type_ == "double":
             return replace(common, width=min(0.15, common.width), broken=sampler.weighted_choice(BROKEN_STRIPE))
         return common
 
@@ -132,9 +169,41 @@ class _Painter:
 
 def sample_layout(sampler: RandomSampler, style: RoadStyle) -> Layout:
     """Samples a cross-section of the given style; 12 % are for left-hand traffic."""
-    maker = {"highway": _highway, "country": _country, "street": _street, "lane": _bare_lane}[style]
+    maker = {
+        "highway": _highway,
+        "country": _country,
+        "street": _street,
+        "lane": _bare_lane,
+        "campus": _campus,
+        "square": _square,
+    }[style]
     layout = maker(sampler)
-    return layout.mirrored() if sampler.bernoulli(0.12) else layout
+    layout = layout.with_edges(*_edges(sampler.branch(), style))
+    return _with_old_paint(sampler.branch(), layout.mirrored() if sampler.bernoulli(0.12) else layout)
+
+
+def _edges(sampler: RandomSampler, style: RoadStyle) -> tuple[EdgeType | None, EdgeType | None]:
+    """Samples the types of the right and the left edge, mostly equal; some small roads open into a yard."""
+    if style == "square":
+        return None, None
+    kerbs: dict[EdgeType, float] = {"kerb": KERB_SHARES[style], "edge": 1.0 - KERB_SHARES[style]}
+    right = sampler.weighted_choice(kerbs)
+    left = right if sampler.bernoulli(0.75) else sampler.weighted_choice(kerbs)
+    if style == "campus" and sampler.bernoulli(0.06):
+        return right, None
+    return right, left
+
+
+def _with_old_paint(sampler: RandomSampler, layout: Layout) -> Layout:
+    """Returns the same road, sometimes with yellow paint that is nearly white."""
+    if not sampler.bernoulli(FADED_SHARE):
+        return layout
+    fade = sampler.uniform(0.4, 0.9)
+    boundaries = tuple(
+        replace(boundary, marking=replace(boundary.marking, fade=fade)) if boundary.marking else boundary
+        for boundary in layout.boundaries
+    )
+    return replace(layout, boundaries=boundaries)
 
 
 def _tone(sampler: RandomSampler, *, concrete: bool) -> float:
@@ -147,7 +216,7 @@ def _highway(sampler: RandomSampler) -> Layout:
     concrete = sampler.bernoulli(0.45)
     tone = _tone(sampler, concrete=concrete)
     paint = _Painter.for_road(sampler, tone)
-    mixed, usual_kind = sampler.bernoulli(MIXED_DIVIDER_SHARE), sampler.weighted_choice(LANE_DIVIDER)
+    mixed, usual_type = sampler.bernoulli(MIXED_DIVIDER_SHARE), sampler.weighted_choice(LANE_DIVIDER)
     boundaries = []
     for index in range(lanes + 1):
         u = (ego + 0.5 - index) * width
@@ -160,7 +229,7 @@ def _highway(sampler: RandomSampler) -> Layout:
         elif index == 1 and lanes > 2 and sampler.bernoulli(0.07):
             marking = paint.line("double", sampler.choice(PAINT_COLORS))
         else:
-            marking = paint.line(sampler.weighted_choice(LANE_DIVIDER) if mixed else usual_kind, "white")
+            marking = paint.line(sampler.weighted_choice(LANE_DIVIDER) if mixed else usual_type, "white")
         boundaries.append(Boundary(u, marking))
     left, right = sampler.uniform(0.4, 3.2), sampler.uniform(0.6, 3.6)
     paved = (boundaries[-1].u - right, boundaries[0].u + left)
@@ -178,20 +247,17 @@ def _country(sampler: RandomSampler) -> Layout:
     )
     side = sampler.weighted_choice(ROAD_SIDE)
     shoulder = sampler.uniform(0.15, 1.2)
-    sides = []
-    for u, outward in ((1.5 * width, 1.0), (-0.5 * width, -1.0)):
-        if side is None:
-            sides.append(Boundary(u + outward * shoulder * 0.3, None))
-        else:
-            sides.append(Boundary(u, paint.line(side, "white")))
-    boundaries = (sides[0], Boundary(0.5 * width, center), sides[1])
-    margin = 0.0 if side is None else shoulder
-    paved = (sides[1].u - margin, sides[0].u + margin)
+    boundaries: tuple[Boundary, ...] = (Boundary(0.5 * width, center),)
+    if side:
+        left, right = (Boundary(u, paint.line(side, "white")) for u in (1.5 * width, -0.5 * width))
+        boundaries = (left, *boundaries, right)
+    margin = shoulder if side else 0.3 * shoulder
+    paved = (-0.5 * width - margin, 1.5 * width + margin)
     return Layout("country", boundaries, (0.0,), (width,), width, paved, False, tone)
 
 
 def _street(sampler: RandomSampler) -> Layout:
-    """Samples a street between curbs; sides without paint have no label either."""
+    """Samples a street, mostly between kerbs, with room to park on either side."""
     width, lanes = sampler.uniform(2.8, 3.5), sampler.integer(1, 3)
     oncoming_lanes = sampler.choice((0, 1, 1, 2))
     concrete = sampler.bernoulli(0.12)
@@ -214,9 +280,10 @@ def _street(sampler: RandomSampler) -> Layout:
     elif sampler.bernoulli(0.6):
         boundaries.append(Boundary(left, paint.line("solid", sampler.choice(PAINT_COLORS))))
     boundaries += [Boundary(left - k * width, paint.line("dashed", "white")) for k in range(1, lanes)]
-    if sampler.bernoulli(0.6):
-        boundaries.append(Boundary(left - lanes * width, paint.line("solid", "white")))
     parking = sampler.choice((0.4, 0.8, 2.4))
+    bays = parking > 2.0 and sampler.bernoulli(0.2)
+    if bays or sampler.bernoulli(0.6):
+        boundaries.append(Boundary(left - lanes * width, paint.line("dashed" if bays else "solid", "white")))
     paved = (left - lanes * width - parking, left + oncoming_lanes * width + sampler.choice((0.4, 2.4)))
     ahead = tuple(left - (k + 0.5) * width for k in range(lanes))
     oncoming = tuple(left + (k + 0.5) * width for k in range(oncoming_lanes))
@@ -231,8 +298,25 @@ def _bare_lane(sampler: RandomSampler) -> Layout:
     two_way = sampler.bernoulli(0.55)
     reach = sampler.uniform(0.55, 0.7) * width
     left = 1.5 * width if two_way else reach
-    boundaries = [Boundary(left, None), Boundary(-reach, None)]
+    boundaries: tuple[Boundary, ...] = ()
     if two_way and sampler.bernoulli(0.5):
-        boundaries.insert(1, Boundary(0.5 * width, paint.line("dashed", sampler.choice(PAINT_COLORS))))
+        boundaries = (Boundary(0.5 * width, paint.line("dashed", sampler.choice(PAINT_COLORS))),)
     oncoming = (width,) if two_way else ()
-    return Layout("lane", tuple(boundaries), (0.0,), oncoming, width, (-reach, left), False, tone)
+    return Layout("lane", boundaries, (0.0,), oncoming, width, (-reach, left), False, tone)
+
+
+def _campus(sampler: RandomSampler) -> Layout:
+    """Samples a two-way road without any marking: on a campus or between houses."""
+    width = sampler.uniform(4.0, 9.0)
+    concrete = sampler.bernoulli(0.25)
+    lane = width / 2.0
+    paved = (-0.5 * lane, 1.5 * lane)
+    layout = Layout("campus", (), (0.0,), (lane,), lane, paved, concrete, _tone(sampler, concrete=concrete))
+    return layout.mirrored() if sampler.bernoulli(0.35) else layout
+
+
+def _square(sampler: RandomSampler) -> Layout:
+    """Samples a square or a car park, whose pavement has no edge nearby."""
+    concrete = sampler.bernoulli(0.3)
+    paved = (-PAVED_REACH, PAVED_REACH)
+    return Layout("square", (), (0.0,), (), 3.5, paved, concrete, _tone(sampler, concrete=concrete))

@@ -47,7 +47,7 @@ class Stencil:
 
 @dataclass(frozen=True)
 class Bars:
-    """Bars across the road: a stop line, or the bars of a crosswalk. Meters."""
+    """Bars across the road: a stop line, or the bars of a crosswalk or a speed bump. Meters."""
 
     s: float
     length: float  # along the road
@@ -56,6 +56,20 @@ class Bars:
     period: float  # across the road; 0 for a single unbroken bar
     bar: float  # width of each bar across the road
     brightness: float
+    wear: float
+    seed: int
+    yellow: bool = False
+
+
+@dataclass(frozen=True)
+class ParkingBays:
+    """Lines across the road from u = low to u = high, every `period` meters, that separate parking bays."""
+
+    low: float
+    high: float
+    period: float
+    width: float
+    color: Color
     wear: float
     seed: int
 
@@ -67,14 +81,15 @@ class Paintwork:
     ghosts: tuple[GhostMarking, ...] = ()
     stencils: tuple[Stencil, ...] = ()
     bars: tuple[Bars, ...] = ()
+    bays: tuple[ParkingBays, ...] = ()
 
 
 def paint_color(marking: Marking) -> Color:
     """Returns blue, green, red of a marking in full daylight."""
-    shade = marking.brightness
+    shade, fade = marking.brightness, marking.fade
     if marking.color == "white":
         return (0.97 * shade, shade, 0.99 * shade)
-    return (0.28 * shade, 0.78 * shade, shade)
+    return ((0.28 + 0.55 * fade) * shade, (0.78 + 0.1 * fade) * shade, shade)
 
 
 def paint_boundaries(grid: GroundGrid, road: Road, ground: Float32Array) -> None:
@@ -86,7 +101,7 @@ def paint_boundaries(grid: GroundGrid, road: Road, ground: Float32Array) -> None
 
 
 def paint_other_marks(grid: GroundGrid, paintwork: Paintwork, ground: Float32Array) -> None:
-    """Paints ghost markings, stencils and bars onto the unlit ground, in place."""
+    """Paints ghost markings, stencils, bars and parking bays onto the unlit ground, in place."""
     projection = grid.projection
     for ghost in paintwork.ghosts:
         band = grid.band(ghost.u - ghost.sway - 0.3, ghost.u + ghost.sway + 0.3)
@@ -99,15 +114,19 @@ def paint_other_marks(grid: GroundGrid, paintwork: Paintwork, ground: Float32Arr
     for bars in paintwork.bars:
         if projection.overlaps(bars.s, bars.s + bars.length):
             _paint_bars(grid, bars, ground)
+    for bays in paintwork.bays:
+        band = grid.band(bays.low, bays.high)
+        cover = pulse(band.s, bays.period, bays.width, band.along) * ((band.u > bays.low) & (band.u < bays.high))
+        _blend(ground, band, cover * _paint_left(band, bays.wear, bays.seed), bays.color)
 
 
 def marking_coverage(band: GroundBand, u: float, marking: Marking) -> Float32Array:
     """Returns the share of each pixel of the band that is covered by paint, (N,)."""
     offset = band.u - np.float32(u)
     s = band.s - np.float32(marking.phase)
-    if marking.kind == "botts":
+    if marking.type == "dots":
         return _dots(band, offset, s, marking)
-    if marking.kind == "double":
+    if marking.type == "double":
         half = np.float32((marking.gap + marking.width) / 2.0)
         stripes = []
         for name, side in (("left", half), ("right", -half)):
@@ -117,7 +136,7 @@ def marking_coverage(band: GroundBand, u: float, marking: Marking) -> Float32Arr
         cover = stripes[0] + stripes[1]
     else:
         cover = coverage(offset, marking.width, band.across)
-        if marking.kind == "dashed":
+        if marking.type == "dashed":
             cover *= pulse(s, marking.period, marking.dash, band.along)
     return cover * _paint_left(band, marking.wear, marking.seed)
 
@@ -220,4 +239,5 @@ def _paint_bars(grid: GroundGrid, bars: Bars, ground: Float32Array) -> None:
         cover *= pulse(band.u - np.float32(bars.low), bars.period, bars.bar, band.across)
     cover *= (band.u > bars.low) & (band.u < bars.high)
     shade = bars.brightness
-    _blend(ground, band, cover * _paint_left(band, bars.wear, bars.seed), (shade, shade, shade))
+    color: Color = (0.28 * shade, 0.78 * shade, shade) if bars.yellow else (shade, shade, shade)
+    _blend(ground, band, cover * _paint_left(band, bars.wear, bars.seed), color)

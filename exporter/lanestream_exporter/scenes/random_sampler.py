@@ -45,6 +45,10 @@ class RandomSampler:
         keys: list[T] = list(options)
         return keys[int(self.rng.choice(len(weights), p=weights / weights.sum()))]
 
+    def branch(self) -> RandomSampler:
+        """Returns an independent sampler; what it draws does not change what this one draws."""
+        return RandomSampler(self.rng.spawn(1)[0])
+
     def seed(self) -> int:
         """Returns a seed for a generator that is created later."""
         return int(self.rng.integers(2**31))

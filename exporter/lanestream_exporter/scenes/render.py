@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,14 +11,15 @@ import numpy as np
 
 from lanestream_exporter.datasets.labels import WHOLE, LabeledFrame, LabeledLane
 from lanestream_exporter.scenes.backdrop import draw_backdrop
+from lanestream_exporter.scenes.kerbs import draw_kerb
 from lanestream_exporter.scenes.lens import develop
 from lanestream_exporter.scenes.light import haze_ground, light_ground
 from lanestream_exporter.scenes.markings import paint_boundaries, paint_other_marks
 from lanestream_exporter.scenes.projection import GroundGrid, RoadProjection
 from lanestream_exporter.scenes.render_target import RenderTarget
 from lanestream_exporter.scenes.roadside import Bridge, RoadsideItem, draw_bridge, draw_item, draw_wall
-from lanestream_exporter.scenes.surface import paint_ground
-from lanestream_exporter.scenes.traffic import Vehicle, draw_vehicle
+from lanestream_exporter.scenes.surface import cover_with_dust, paint_ground
+from lanestream_exporter.scenes.traffic import Vehicle, draw_vehicle, mark_covered
 
 if TYPE_CHECKING:
     from lanestream.road.curve import FloatArray
@@ -32,6 +34,8 @@ MIN_LANE_WIDTH = 12.0  # pixels of a 640 pixel wide image; the boundaries of nar
 TYPICAL_LANE_WIDTH = 3.5  # meters
 LABEL_ROWS = 90  # approximate number of rows with label points over the image height
 MIN_LABEL_SPAN = 0.05  # share of the image height that a label must span
+EDGE_MARGIN = 2.0  # pixels between an edge and the place beside it where the pavement must be visible
+MOST_COVERED = 0.8  # share of an edge that vehicles may hide
 
 MAX_OBJECT_LENGTH = 30.0  # meters that an object extends beyond its s
 
@@ -74,13 +78,20 @@ def _draw_ground(target: RenderTarget, scene: Scene, grid: GroundGrid) -> None:
     ground = paint_ground(grid, scene.surface)
     paint_other_marks(grid, scene.paintwork, ground)
     paint_boundaries(grid, scene.road, ground)
+    for dust in scene.surface.dust:
+        cover_with_dust(grid, dust, ground)
     light_ground(grid, scene.light, ground)
     haze_ground(grid, scene.atmosphere, ground)
     cv2.convertScaleAbs(ground, target.image[grid.top :], alpha=255.0)
 
 
 def _draw_objects(target: RenderTarget, scene: Scene) -> None:
-    """Draws objects from far to near; those behind a wall before the wall, those inside the walls after it."""
+    """Draws objects from far to near; those behind a wall before the wall, those inside the walls after it.
+
+    Kerbs are so low that they hide the ground only.
+    """
+    for kerb in scene.kerbs:
+        draw_kerb(target, kerb)
     left = min((wall.u for wall in scene.walls if wall.u > scene.pose.u), default=1e6)
     right = max((wall.u for wall in scene.walls if wall.u < scene.pose.u), default=-1e6)
     everything: tuple[Bridge | RoadsideItem | Vehicle, ...] = (*scene.bridges, *scene.items, *scene.traffic)
@@ -120,19 +131,31 @@ def _reflect(target: RenderTarget, grid: GroundGrid, wetness: float) -> None:
 def annotate(scene: Scene, projection: RoadProjection, hidden: Image, label_rows: int = LABEL_ROWS) -> LabeledFrame:
     """Returns the labels of a frame, with points in about `label_rows` rows over the image height.
 
-    `hidden` (H, W) is non-zero where walls, trees or houses hide the road.
+    `hidden` (H, W) is non-zero where walls, trees or houses hide the road. Labels run through vehicles, but an edge
+    that they hide nearly everywhere has no label.
     """
     camera = scene.camera
     rows = _rows(scene, projection, label_rows)
+    covered = np.zeros_like(hidden)
+    for vehicle in scene.traffic:
+        if vehicle.s < scene.pose.s + MAX_LABEL_DISTANCE:
+            mark_covered(covered, projection, vehicle)
     lanes = []
     for lane_id, position in enumerate(scene.road.positions(scene.pose.s, scene.pose.u)):
         boundary = scene.road.boundaries[lane_id]
-        points = _visible(scene, hidden, _boundary_points(boundary, projection, rows))
+        points = _boundary_points(boundary, projection, rows)
+        # A wall may stand right at an edge: look at the pavement beside it.
+        inward = 0.0 if boundary.marking else math.copysign(EDGE_MARGIN, boundary.u - scene.pose.u)
+        points = _visible(scene, hidden, points, inward)
         if len(points) < 3 or points[0, 1] - points[-1, 1] < MIN_LABEL_SPAN * camera.height:
             continue
+        if boundary.marking is None and _covered_share(points, covered) > MOST_COVERED:
+            continue
         color = boundary.marking.color if boundary.marking else None
-        lanes.append(LabeledLane(points, lane_id, position, boundary.kind, color))
-    return LabeledFrame(camera.width, camera.height, tuple(lanes), scene.name, SOURCE, WHOLE)
+        lanes.append(LabeledLane(points, lane_id, position, boundary.type, color))
+    return LabeledFrame(
+        camera.width, camera.height, tuple(lanes), scene.name, SOURCE, WHOLE, horizon=float(camera.horizon)
+    )
 
 
 def _boundary_points(boundary: Boundary, projection: RoadProjection, rows: FloatArray) -> FloatArray:
@@ -161,8 +184,17 @@ def visibility(scene: Scene) -> float:
     return min(haze, 2.5 * scene.light.headlights) if scene.light.headlights > 0.0 else haze
 
 
-def _visible(scene: Scene, hidden: Image, points: FloatArray) -> FloatArray:
-    """Returns the points inside the image and above the hood, without a far end hidden by a solid object."""
+def _covered_share(points: FloatArray, covered: Image) -> float:
+    """Returns the share of points (N, 2) that lie where the mask (H, W) is set."""
+    columns, rows = np.round(points).astype(int).T
+    return float(np.mean(covered[rows, columns] > 0))
+
+
+def _visible(scene: Scene, hidden: Image, points: FloatArray, inward: float) -> FloatArray:
+    """Returns the points inside the image and above the hood, without a far end hidden by a solid object.
+
+    What hides a point is looked up `inward` pixels to its right.
+    """
     width, height = scene.camera.width, scene.camera.height
     points = points[(points[:, 0] >= 0.0) & (points[:, 0] <= width - 1)]
     if not len(points):
@@ -171,5 +203,6 @@ def _visible(scene: Scene, hidden: Image, points: FloatArray) -> FloatArray:
     if scene.lens.hood:
         above = rows < scene.lens.hood.top(width, height)[columns] - 1.0
         points, columns, rows = points[above], columns[above], rows[above]
-    visible = np.flatnonzero(hidden[rows, columns] == 0)
+    beside = np.clip(np.round(points[:, 0] + inward).astype(int), 0, width - 1)
+    visible = np.flatnonzero(hidden[rows, beside] == 0)
     return points[: visible[-1] + 1] if len(visible) else points[:0]

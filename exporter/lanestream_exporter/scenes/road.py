@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
+    from lanestream.road.appearance import MarkingColor, MarkingType
     from lanestream.road.curve import FloatArray
 
-MarkingKind = Literal["solid", "dashed", "double", "botts"]
-PaintColor = Literal["white", "yellow"]
+EdgeType = Literal["kerb", "edge"]
 Stripe = Literal["neither", "left", "right"]
 
 
@@ -53,8 +53,8 @@ class Pose:
 class Marking:
     """Paint or dots on a lane boundary. Lengths in meters."""
 
-    kind: MarkingKind
-    color: PaintColor
+    type: MarkingType
+    color: MarkingColor
     width: float  # of one stripe, or the diameter of a dot
     brightness: float  # of fresh paint in daylight, 0 to 1
     wear: float  # share of the paint that is missing, 0 to 1
@@ -64,6 +64,7 @@ class Marking:
     gap: float = 0.12  # between the stripes of a double line
     broken: Stripe = "neither"  # which stripe of a double line is dashed
     dots: int = 4  # in a group, over the length `dash`
+    fade: float = 0.0  # how pale yellow paint has become: from 0, fresh, to 1, a whitish pink
     seed: int = 0
 
 
@@ -83,9 +84,10 @@ class Taper:
 
 @dataclass(frozen=True)
 class Boundary:
-    """A lane boundary at lateral position u in meters; without a marking it is the unmarked edge of the road.
+    """A boundary at lateral position u in meters; without a marking it is an edge of the paved road.
 
-    It reaches from s = `first` to s = `last`; a `taper` moves it to the side.
+    It reaches from s = `first` to s = `last`; a `taper` moves it to the side. `edge` is the type of an edge: the foot
+    of a kerb, or any other place where the pavement ends.
     """
 
     u: float
@@ -93,6 +95,7 @@ class Boundary:
     taper: Taper | None = None
     first: float = -math.inf
     last: float = math.inf
+    edge: EdgeType = "edge"
 
     def u_at(self, s: FloatArray) -> FloatArray:
         """Returns the lateral positions at the road positions s, in meters."""
@@ -103,14 +106,17 @@ class Boundary:
         return self.first <= s <= self.last
 
     @property
-    def kind(self) -> str:
-        """Returns the kind for the label: that of the marking, or "edge"."""
-        return self.marking.kind if self.marking else "edge"
+    def type(self) -> MarkingType | EdgeType:
+        """Returns the type for the label: that of the marking, or of the edge."""
+        return self.marking.type if self.marking else self.edge
 
 
 @dataclass(frozen=True)
 class Road:
-    """A road: its course and its boundaries from left to right, none of which cross. Their index is their lane id."""
+    """A road: its course and its boundaries from left to right, none of which cross. Their index is their lane id.
+
+    Its edges, if it has any, are the outermost boundaries.
+    """
 
     course: Course
     boundaries: tuple[Boundary, ...]

@@ -1,4 +1,4 @@
-"""Objects next to and above the road: barriers, rails, curbs, trees, posts, houses and bridges."""
+"""Objects next to and above the road: barriers, rails, hedges, trees, posts, houses and bridges."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lanestream_exporter.scenes.render_target import RenderTarget
     from lanestream_exporter.scenes.surface import Color
 
-WallKind = Literal["jersey", "rail", "curb", "fence", "hedge"]
+WallKind = Literal["jersey", "rail", "fence", "hedge"]
 ItemKind = Literal["tree", "bush", "post", "lamp", "sign", "house"]
 
 NEAREST = 0.5  # meters ahead of the lens where long objects start
@@ -29,7 +29,6 @@ SPRITES = 6  # number of different tree sprites
 WALL_STRIPES: dict[WallKind, tuple[tuple[tuple[float, float, float], ...], float]] = {
     "jersey": (((0.0, 0.1, 0.75), (0.1, 0.4, 1.1), (0.4, 0.95, 0.88), (0.95, 1.0, 1.2)), 6.0),
     "rail": (((0.55, 0.68, 0.8), (0.68, 0.8, 1.15), (0.8, 0.88, 0.7), (0.88, 1.0, 1.1)), 4.0),
-    "curb": (((0.0, 1.0, 0.8),), 0.0),
     "fence": (((0.45, 0.52, 0.9), (0.93, 1.0, 1.0)), 3.0),
     "hedge": (((0.0, 0.5, 0.7), (0.5, 0.9, 1.0), (0.9, 1.0, 1.25)), 0.0),
 }

@@ -10,15 +10,18 @@ import numpy as np
 from lanestream_exporter.scenes.layout import Layout, RoadStyle, sample_layout
 from lanestream_exporter.scenes.lens import Glare, Hood, Lens
 from lanestream_exporter.scenes.light import Atmosphere, SceneLight
+from lanestream_exporter.scenes.paint_sampling import sample_humps, sample_paintwork
 from lanestream_exporter.scenes.projection import PinholeCamera
 from lanestream_exporter.scenes.random_sampler import RandomSampler
 from lanestream_exporter.scenes.road import Course, Pose, Road
-from lanestream_exporter.scenes.surface_sampling import gray, sample_paintwork, sample_repairs, sample_surface
+from lanestream_exporter.scenes.surface_sampling import gray, sample_repairs, sample_surface
 from lanestream_exporter.scenes.surroundings_sampling import (
     ShadowCasters,
     sample_backdrop,
     sample_bridges,
     sample_items,
+    sample_kerbs,
+    sample_queues,
     sample_shadows,
     sample_traffic,
     sample_walls,
@@ -26,6 +29,7 @@ from lanestream_exporter.scenes.surroundings_sampling import (
 
 if TYPE_CHECKING:
     from lanestream_exporter.scenes.backdrop import Backdrop
+    from lanestream_exporter.scenes.kerbs import Kerb
     from lanestream_exporter.scenes.markings import Paintwork
     from lanestream_exporter.scenes.roadside import Bridge, RoadsideItem, Wall
     from lanestream_exporter.scenes.surface import Color, Surface
@@ -34,15 +38,39 @@ if TYPE_CHECKING:
 STILL_LENGTH = 260.0  # meters of road that are visible in a still
 START = 20.0  # s of the vehicle at the start, meters, so that there is some road behind it
 
-STYLES: dict[RoadStyle, float] = {"highway": 0.52, "country": 0.27, "street": 0.14, "lane": 0.07}
-MAX_CURVATURE: dict[RoadStyle, float] = {"highway": 1 / 250, "country": 1 / 30, "street": 1 / 60, "lane": 1 / 30}  # 1/m
+STYLES: dict[RoadStyle, float] = {
+    "highway": 0.39,
+    "country": 0.21,
+    "street": 0.18,
+    "lane": 0.08,
+    "campus": 0.11,
+    "square": 0.03,
+}
+MAX_CURVATURE: dict[RoadStyle, float] = {
+    "highway": 1 / 250,
+    "country": 1 / 30,
+    "street": 1 / 60,
+    "lane": 1 / 30,
+    "campus": 1 / 40,
+    "square": 1 / 60,
+}  # 1/m
 VERTICAL_CURVATURE: dict[RoadStyle, float] = {
     "highway": 1.5e-4,
     "country": 6e-4,
     "street": 4e-4,
     "lane": 6e-4,
+    "campus": 3e-4,
+    "square": 0.0,
 }  # sigma of the vertical curvature, 1/m
-KNOT_SPACING: dict[RoadStyle, float] = {"highway": 40.0, "country": 20.0, "street": 25.0, "lane": 20.0}  # meters
+KNOT_SPACING: dict[RoadStyle, float] = {
+    "highway": 40.0,
+    "country": 20.0,
+    "street": 25.0,
+    "lane": 20.0,
+    "campus": 20.0,
+    "square": 40.0,
+}  # meters
+QUEUE_SHARES: dict[RoadStyle, float] = {"highway": 0.1, "street": 0.25}  # stills with standing traffic, by style
 
 
 @dataclass(frozen=True)
@@ -59,6 +87,7 @@ class Scene:
     atmosphere: Atmosphere
     backdrop: Backdrop
     lens: Lens
+    kerbs: tuple[Kerb, ...] = ()
     walls: tuple[Wall, ...] = ()
     items: tuple[RoadsideItem, ...] = ()
     bridges: tuple[Bridge, ...] = ()
@@ -79,9 +108,32 @@ class Weather:
 def sample_scene(rng: np.random.Generator, width: int, height: int) -> Scene:
     """Samples a scene for a still of the given size in pixels."""
     sampler = RandomSampler(rng)
-    return compose_scene(
-        sampler, (width, height), sampler.weighted_choice(STYLES), sample_weather(sampler), STILL_LENGTH
-    )
+    style = sampler.weighted_choice(STYLES)
+    scene = compose_scene(sampler, (width, height), style, sample_weather(sampler), STILL_LENGTH)
+    if sampler.bernoulli(QUEUE_SHARES.get(style, 0.0)):
+        elsewhere = tuple(car for car in scene.traffic if all(abs(car.u - lane) > 1.5 for lane in scene.road.lanes))
+        queues = sample_queues(sampler, scene.road.lanes, START, STILL_LENGTH)
+        scene = replace(scene, traffic=(*elsewhere, *queues))
+    return _seen_by_other_cameras(sampler, scene)
+
+
+def _seen_by_other_cameras(sampler: RandomSampler, scene: Scene) -> Scene:
+    """Returns 12 % of the scenes as a camera sees them that looks down on the road, and 8 % near the ground.
+
+    The horizon of a camera that looks down may lie above the image.
+    """
+    camera, place = scene.camera, sampler.uniform(0.0, 1.0)
+    if place < 0.12:
+        camera = replace(
+            camera,
+            field_of_view=sampler.uniform(42.0, 75.0),
+            mount_height=sampler.uniform(1.8, 2.8),
+            horizon=camera.height * sampler.uniform(-0.35, 0.05),
+        )
+        return replace(scene, camera=camera, lens=replace(scene.lens, hood=None))
+    if place < 0.2:
+        return replace(scene, camera=replace(camera, mount_height=sampler.uniform(0.4, 0.9)))
+    return scene
 
 
 def compose_scene(
@@ -98,8 +150,10 @@ def compose_scene(
         else sample_shadows(sampler, layout, ShadowCasters(walls, bridges, length))
     )
     surface = replace(sample_surface(sampler, layout), repairs=sample_repairs(sampler, layout, length))
+    humps, bars = sample_humps(sampler.branch(), layout, length)
+    surface = replace(surface, repairs=(*surface.repairs, *humps))
     backdrop = sample_backdrop(sampler, night=weather.night, overcast=weather.overcast)
-    return Scene(
+    scene = Scene(
         name=f"rendered-{style}-{sampler.seed():08x}",
         camera=sample_camera(sampler, size),
         pose=_pose(sampler, layout),
@@ -110,12 +164,14 @@ def compose_scene(
         atmosphere=_atmosphere(sampler, weather, backdrop.skyline),
         backdrop=backdrop,
         lens=sample_lens(sampler, weather),
+        kerbs=sample_kerbs(sampler.branch(), layout),
         walls=walls,
         items=sample_items(sampler, layout, length),
         bridges=bridges,
         traffic=sample_traffic(sampler, layout, START, length),
         wetness=sampler.uniform(0.15, 0.5) if weather.wet else 0.0,
     )
+    return replace(scene, paintwork=replace(scene.paintwork, bars=(*scene.paintwork.bars, *bars)))
 
 
 def sample_weather(sampler: RandomSampler) -> Weather:
@@ -149,9 +205,18 @@ def sample_course(sampler: RandomSampler, style: RoadStyle, length: float) -> Co
 
 def _pose(sampler: RandomSampler, layout: Layout) -> Pose:
     """Samples a pose in the lane, sometimes between two lanes; the heading includes the camera's own yaw."""
+    if layout.style == "campus":
+        return Pose(START, _place_on_unmarked_road(sampler, layout), sampler.normal(0.06))
     changing_lanes = sampler.bernoulli(0.08) and len(layout.ahead) > 1
     u = sampler.uniform(-0.5, 0.5) * layout.lane_width if changing_lanes else sampler.normal(0.22)
     return Pose(START, u, sampler.normal(0.025 if layout.style == "highway" else 0.04))
+
+
+def _place_on_unmarked_road(sampler: RandomSampler, layout: Layout) -> float:
+    """Samples u in meters anywhere between the near edge and a little beyond the middle of the road."""
+    side = 1.0 if layout.oncoming[0] > 0.0 else -1.0  # of the oncoming lane
+    half = layout.lane_width / 2.0  # the middle of the road is at half, the near edge at -half
+    return side * sampler.uniform(1.0 - half, half + 0.2)
 
 
 def _light(sampler: RandomSampler, weather: Weather) -> SceneLight:

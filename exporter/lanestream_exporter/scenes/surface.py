@@ -1,4 +1,4 @@
-"""The unpainted ground: materials, wheel tracks, joints, seams, cracks and repairs."""
+"""The unpainted ground: materials, wheel tracks, joints, seams, cracks, repairs and dust."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lanestream_exporter.scenes.noise import ground_noise, noise_tiles, sample_noise
 from lanestream_exporter.scenes.projection import Float32Array, GroundGrid, coverage, pulse
@@ -76,6 +77,28 @@ class PavementRepair:
 
 
 @dataclass(frozen=True)
+class RaggedEdge:
+    """An edge between two materials whose mean line is u, but which runs in and out. Meters."""
+
+    u: float
+    roughness: float  # sigma of its distance from the mean line
+    cell: float  # size of the smallest notches along the road
+    seed: int
+
+
+@dataclass(frozen=True)
+class Dust:
+    """A film of dust over asphalt and paint, thickest at the edge u and gone after `reach` toward the road. Meters."""
+
+    u: float
+    reach: float
+    inward: float  # direction of the road from the edge: +1 left, -1 right
+    color: Color
+    thickness: float  # share of the ground that it hides at the edge, 0 to 1
+    seed: int
+
+
+@dataclass(frozen=True)
 class Surface:
     """Everything on the ground except paint."""
 
@@ -84,6 +107,8 @@ class Surface:
     seams: tuple[Seam, ...] = ()
     joints: tuple[Joint, ...] = ()
     repairs: tuple[PavementRepair, ...] = ()
+    ragged: tuple[RaggedEdge, ...] = ()
+    dust: tuple[Dust, ...] = ()
     grain: float = 0.04  # strength of the aggregate texture
     mottle: float = 0.05  # strength of blotches
     streaks: float = 0.04  # strength of marks along the direction of travel
@@ -111,7 +136,9 @@ def _lay_materials(grid: GroundGrid, surface: Surface) -> tuple[Float32Array, Fl
     The profile is blurred to the footprint of a pixel, in a few steps from near to far rows, to keep edges smooth.
     """
     profile = _profile(surface)
-    index = ((grid.u + np.float32(PROFILE_REACH)) * np.float32(1.0 / PROFILE_STEP)).astype(np.int32)
+    index = _profile_index(grid.u)
+    for edge in surface.ragged:
+        _fray(grid, edge, index)
     np.clip(index, 0, len(profile) - 1, out=index)
     ground = np.empty((*grid.shape, 3), np.float32)
     roughness = np.empty(grid.shape, np.float32)
@@ -125,6 +152,34 @@ def _lay_materials(grid: GroundGrid, surface: Surface) -> tuple[Float32Array, Fl
             ground[block] = np.take(smooth[:, :3], index[block], axis=0)
             roughness[block] = np.take(smooth[:, 3], index[block])
     return ground, roughness
+
+
+def _profile_index(u: Float32Array) -> NDArray[np.int32]:
+    """Returns the nearest entries of the lateral profile; they may lie outside it."""
+    return np.asarray((u + np.float32(PROFILE_REACH)) * np.float32(1.0 / PROFILE_STEP) + np.float32(0.5), np.int32)
+
+
+def _fray(grid: GroundGrid, edge: RaggedEdge, index: NDArray[np.int32]) -> None:
+    """Shifts the lookup of the materials beside a ragged edge, in place; the shift has zero mean."""
+    band = grid.band(edge.u - 4.0 * edge.roughness, edge.u + 4.0 * edge.roughness)
+    along = np.zeros_like(band.s)
+    shift = sample_noise(noise_tiles().fine, along, band.s, (1.0, edge.cell), edge.seed)
+    shift += 0.8 * sample_noise(noise_tiles().fine, along, band.s, (1.0, 4.0 * edge.cell), edge.seed + 1)
+    # A far pixel averages over many notches.
+    shift *= np.float32(0.78 * edge.roughness) * np.minimum(1.0, 3.0 * edge.cell / np.maximum(band.along, 0.01))
+    index.reshape(-1)[band.index] = _profile_index(band.u + shift)
+
+
+def cover_with_dust(grid: GroundGrid, dust: Dust, ground: Float32Array) -> None:
+    """Covers the painted, unlit ground with dust, in place."""
+    far = dust.u + dust.inward * dust.reach
+    band = grid.band(min(dust.u, far), max(dust.u, far))
+    share = np.clip((far - band.u) * np.float32(dust.inward / dust.reach), 0.0, 1.0)
+    share *= (band.u - np.float32(dust.u)) * np.float32(dust.inward) > 0.0
+    noise = sample_noise(noise_tiles().cloud, band.u, band.s, (0.02, 0.06), dust.seed)
+    share = np.clip(np.float32(dust.thickness) * share * (1.0 + 0.4 * noise), 0.0, 0.95)[:, None]
+    flat = ground.reshape(-1, 3)
+    flat[band.index] += share * (np.array(dust.color, np.float32) - flat[band.index])
 
 
 def _profile(surface: Surface) -> Float32Array:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
 
 from lanestream_exporter.scenes.backdrop import Backdrop, Ridge
+from lanestream_exporter.scenes.kerbs import Kerb
 from lanestream_exporter.scenes.light import BandShadow, LineShadow, Shadow, TreeShadow
 from lanestream_exporter.scenes.roadside import Bridge, ItemKind, RoadsideItem, Wall, WallKind
 from lanestream_exporter.scenes.surface_sampling import gray
@@ -48,7 +49,25 @@ VEHICLE_SIZES: dict[VehicleKind, tuple[float, float, float]] = {  # length, widt
     "van": (5.0, 1.95, 2.0),
     "truck": (11.0, 2.45, 3.6),
 }
-SPEEDS: dict[RoadStyle, float] = {"highway": 27.0, "country": 20.0, "street": 11.0, "lane": 10.0}  # meters per second
+SPEEDS: dict[RoadStyle, float] = {
+    "highway": 27.0,
+    "country": 20.0,
+    "street": 11.0,
+    "lane": 10.0,
+    "campus": 6.0,
+    "square": 4.0,
+}  # meters per second
+
+
+KERB_PAINTS: tuple[tuple[Color, Color | None], ...] = (
+    ((0.92, 0.94, 0.94), (0.08, 0.08, 0.08)),  # white and black
+    ((0.2, 0.72, 0.9), (0.08, 0.08, 0.08)),  # yellow and black
+    ((0.2, 0.18, 0.75), (0.92, 0.94, 0.94)),  # red and white
+    ((0.92, 0.94, 0.94), None),
+    ((0.2, 0.72, 0.9), None),
+)
+ROOM_TO_PASS: Final = 2.2  # meters between the middle of our lane and that of a parked vehicle
+QUEUE_LENGTH: Final = 70.0  # of standing traffic, meters; what stands farther ahead is hidden
 
 
 @dataclass(frozen=True)
@@ -61,19 +80,50 @@ class ShadowCasters:
 
 
 def sample_walls(sampler: RandomSampler, layout: Layout) -> tuple[Wall, ...]:
-    """Samples barriers, rails and curbs at the edges of the pavement."""
+    """Samples barriers, rails, fences and hedges beyond the edges of the pavement, or right at them."""
+    if layout.style in {"street", "square"}:
+        return ()
     right, left = layout.paved
-    if layout.style == "street":
-        color, height = gray(sampler, sampler.uniform(0.45, 0.8)), sampler.uniform(0.1, 0.16)
-        return (Wall("curb", left, height, color), Wall("curb", right, height, color))
     highway = layout.style == "highway"
     kinds = HIGHWAY_WALLS if highway else OTHER_WALLS
     edges = ((left + sampler.uniform(0.0, 0.8), 1.0), (right - sampler.uniform(0.0, 1.2), -1.0))
-    return tuple(
+    walls = [
         _wall(sampler, sampler.weighted_choice(kinds), u, outward)
         for u, outward in edges
         if sampler.bernoulli(0.75 if highway else 0.22)
+    ]
+    return tuple(_moved_to_the_edge(sampler.branch(), wall, layout) for wall in walls)
+
+
+def _moved_to_the_edge(sampler: RandomSampler, wall: Wall, layout: Layout) -> Wall:
+    """Moves some walls so that their foot is the edge of the pavement, and others beyond the sidewalk of a kerb."""
+    left = wall.u > layout.paved[1] - 0.01
+    edge, kind = (layout.paved[1], layout.edges[1]) if left else (layout.paved[0], layout.edges[0])
+    if kind == "kerb":
+        return replace(wall, u=wall.u + (1.0 if left else -1.0) * sampler.uniform(0.5, 4.0))
+    return replace(wall, u=edge) if wall.kind in {"jersey", "hedge"} and sampler.bernoulli(0.4) else wall
+
+
+def sample_kerbs(sampler: RandomSampler, layout: Layout) -> tuple[Kerb, ...]:
+    """Samples the kerbs of a road, of bare stone or painted, plain or in blocks of two colors."""
+    stone = gray(sampler, sampler.uniform(0.25, 0.8))
+    color, other = (stone, None) if sampler.bernoulli(0.68) else sampler.choice(KERB_PAINTS)
+    fade = sampler.uniform(0.55, 1.0)
+    shade = sampler.uniform(0.5, 1.0)
+    # A face that looks like the road would leave only the top to be seen.
+    if other is None and abs(shade * sum(color) / 3.0 - layout.tone) < 0.08:
+        shade *= 0.65
+    height, width, block = sampler.uniform(0.08, 0.2), sampler.uniform(0.1, 0.3), sampler.uniform(0.5, 1.5)
+    sides = ((layout.edges[1], layout.paved[1], 1.0), (layout.edges[0], layout.paved[0], -1.0))
+    return tuple(
+        Kerb(u, outward, height, width, _faded(color, fade), other and _faded(other, fade), block, shade)
+        for edge, u, outward in sides
+        if edge == "kerb"
     )
+
+
+def _faded(color: Color, brightness: float) -> Color:
+    return (color[0] * brightness, color[1] * brightness, color[2] * brightness)
 
 
 def _wall(sampler: RandomSampler, kind: WallKind, u: float, outward: float) -> Wall:
@@ -88,10 +138,14 @@ def sample_items(sampler: RandomSampler, layout: Layout, length: float) -> tuple
     """Samples trees, posts, signs and houses along `length` meters of road."""
     items: list[RoadsideItem] = []
     woods = sampler.uniform(0.0, 0.12) if sampler.bernoulli(0.75) else 0.0
-    town = sampler.uniform(0.02, 0.06) if layout.style == "street" else 0.004 * float(sampler.bernoulli(0.25))
-    for side, edge in ((1.0, layout.paved[1]), (-1.0, -layout.paved[0])):
+    woods *= 2.5 if layout.style == "campus" else 1.0
+    if layout.style in {"street", "campus", "square"}:
+        town = sampler.uniform(0.02, 0.06)
+    else:
+        town = 0.004 * float(sampler.bernoulli(0.25))
+    for side, edge in ((1.0, layout.roadside[1]), (-1.0, -layout.roadside[0])):
         # The trees stand on the far side of the opposite roadway.
-        margin = 16.0 if layout.opposite == side else 4.0
+        margin = 16.0 if layout.opposite == side else 2.0 if layout.style == "campus" else 4.0
         trees = int(woods * length * sampler.uniform(0.2, 1.0))
         items += [_tree(sampler, length, side, edge + margin) for _ in range(trees)]
         items += [_house(sampler, length, side, edge + 12.0) for _ in range(int(town * length))]
@@ -151,7 +205,7 @@ def sample_bridges(sampler: RandomSampler, layout: Layout, length: float) -> tup
                     length=sampler.uniform(8.0, 25.0) if deck else 0.5,
                     clearance=sampler.uniform(5.0, 7.0),
                     depth=sampler.uniform(1.2, 2.2),
-                    reach=max(layout.paved[1], -layout.paved[0]) + sampler.uniform(4.0, 20.0),
+                    reach=max(layout.roadside[1], -layout.roadside[0]) + sampler.uniform(4.0, 20.0),
                     color=gray(sampler, sampler.uniform(0.4, 0.65)) if deck else (0.25, 0.35, 0.1),
                 )
             )
@@ -166,7 +220,7 @@ def sample_shadows(sampler: RandomSampler, layout: Layout, casters: ShadowCaster
         for bridge in casters.bridges
     ]
     for wall in casters.walls:
-        if wall.kind != "curb" and sampler.bernoulli(0.4):
+        if sampler.bernoulli(0.4):
             wide = sampler.uniform(0.3, 2.0)
             shadows.append(LineShadow(wall.u - math.copysign(wide / 2.0, wall.u), wide))
     if sampler.bernoulli(0.35):
@@ -186,7 +240,7 @@ def _tree_shadows(sampler: RandomSampler, layout: Layout, length: float) -> list
         TreeShadow(
             s=start + sampler.uniform(-10.0, 30.0),
             length=sampler.uniform(8.0, 50.0),
-            edge=sampler.uniform(*layout.paved),
+            edge=sampler.uniform(*layout.roadside),
             side=side,
             density=sampler.uniform(0.3, 0.75),
             blotch=sampler.uniform(0.8, 5.0),
@@ -199,7 +253,7 @@ def _tree_shadows(sampler: RandomSampler, layout: Layout, length: float) -> list
 
 
 def sample_traffic(sampler: RandomSampler, layout: Layout, start: float, length: float) -> tuple[Vehicle, ...]:
-    """Samples vehicles in the lanes from s = `start`, at least 4 m apart, and parked vehicles in streets."""
+    """Samples vehicles in the lanes from s = `start`, at least 4 m apart, and parked vehicles."""
     vehicles: list[Vehicle] = []
     density = sampler.choice((0.0, 0.008, 0.015, 0.03))
     usual_speed = SPEEDS[layout.style]
@@ -211,8 +265,38 @@ def sample_traffic(sampler: RandomSampler, layout: Layout, start: float, length:
     opposite = [edge + layout.opposite * away for away in (4.0, 8.0)] if layout.opposite else []
     for lane in (*layout.oncoming, *opposite):
         vehicles += _queue(sampler, lane, (start + sampler.uniform(5.0, 60.0), start + length), density, -usual_speed)
-    if layout.style == "street" and sampler.bernoulli(0.5):
-        vehicles += _queue(sampler, layout.paved[0] + 1.1, (start + 6.0, start + length), 0.06, 0.0)
+    return (*vehicles, *_parked(sampler.branch(), layout, (start + 6.0, start + length)))
+
+
+def _parked(sampler: RandomSampler, layout: Layout, reach: tuple[float, float]) -> list[Vehicle]:
+    """Samples vehicles parked along either edge, some half on the sidewalk, or in rows on a square."""
+    if layout.style == "square":
+        rows = [side * sampler.uniform(5.0, 20.0) for side in (-1.0, 1.0, 1.0) if sampler.bernoulli(0.6)]
+    else:
+        share = {"street": 0.4, "campus": 0.2}.get(layout.style, 0.0)
+        right, left = layout.paved
+        rows = [
+            edge - outward * sampler.uniform(-0.3, 1.2)
+            for edge, outward in ((left, 1.0), (right, -1.0))
+            if sampler.bernoulli(share)
+        ]
+    density = sampler.choice((0.03, 0.06, 0.3))
+    vehicles: list[Vehicle] = []
+    for row in rows:
+        if abs(row) > ROOM_TO_PASS:
+            vehicles += _queue(sampler, row, reach, density, 0.0)
+    return vehicles
+
+
+def sample_queues(sampler: RandomSampler, lanes: tuple[float, ...], start: float, length: float) -> tuple[Vehicle, ...]:
+    """Samples standing traffic in the lanes from s = `start`, with gaps of 2 to 6 m."""
+    vehicles: list[Vehicle] = []
+    for lane in lanes:
+        s = start + (sampler.uniform(6.0, 20.0) if lane == 0.0 else sampler.uniform(1.0, 9.0))
+        while s < start + min(length, QUEUE_LENGTH):
+            vehicle = sample_vehicle(sampler, s, lane + sampler.normal(0.15), 0.0)
+            vehicles.append(vehicle)
+            s += vehicle.length + sampler.uniform(2.0, 6.0)
     return tuple(vehicles)
 
 

@@ -98,8 +98,12 @@ class _Maker:
         lens = replace(scene.lens, hood=None, quality=0) if weather else self._good_lens()
         scene = replace(scene, camera=camera, road=replace(scene.road, course=course), lens=lens)
         if not clutter:
-            # Remains of old markings mislead any detector; other kinds are about tracking.
-            scene = replace(scene, paintwork=replace(scene.paintwork, ghosts=()))
+            # Remains of old markings and dust on paint mislead any detector; other kinds are about tracking.
+            scene = replace(
+                scene,
+                paintwork=replace(scene.paintwork, ghosts=()),
+                surface=replace(scene.surface, dust=()),
+            )
         return Clip(scene, motion, round(seconds * self.fps), self.fps)
 
     def _good_lens(self) -> Lens:
@@ -241,34 +245,36 @@ def _rider(sampler: RandomSampler, lane: float, moves: list[SidewaysMove]) -> Li
 
 
 def _merge(maker: _Maker) -> TrackingClip:
-    """Makes a road on which the outermost lane of a side ends or begins."""
+    """Makes a road on which the outermost lane of a side ends or begins; its pavement goes on."""
     sampler, side = maker.sampler, maker.sampler.choice((1.0, -1.0))
     clip = maker.drive(11.0, "highway", lambda scene: _lane_beyond(scene, side) is not None)
     scene = clip.scene
     start = scene.pose.s + clip.motion.speed * sampler.uniform(2.5, 4.5)
     taper = Taper(start, sampler.uniform(60.0, 140.0), 0.0)
     boundaries = list(scene.road.boundaries)
-    edge, divider = (0, 1) if side > 0.0 else (len(boundaries) - 1, len(boundaries) - 2)
-    boundaries[edge], boundaries[divider] = _tapered(boundaries[edge], boundaries[divider], taper, maker.variant(4))
+    painted = [index for index, boundary in enumerate(boundaries) if boundary.marking]
+    outer, inner = painted[:2] if side > 0.0 else painted[:-3:-1]
+    boundaries[outer], boundaries[inner] = _tapered(boundaries[outer], boundaries[inner], taper, maker.variant(4))
     lanes = sorted(scene.road.lanes)
-    outer = lanes[-1] if side > 0.0 else lanes[0]
-    traffic = tuple(car for car in scene.traffic if abs(car.u - outer) > 1.5)
+    outermost = lanes[-1] if side > 0.0 else lanes[0]
+    traffic = tuple(car for car in scene.traffic if abs(car.u - outermost) > 1.5)
     road = replace(scene.road, boundaries=tuple(boundaries))
     return _whole(TruePart(replace(clip, scene=replace(scene, road=road, traffic=traffic))))
 
 
-def _tapered(edge: Boundary, divider: Boundary, taper: Taper, variant: int) -> tuple[Boundary, Boundary]:
-    """Returns the outermost boundary and the next one of a road whose outer lane ends (0, 1) or begins (2, 3).
+def _tapered(outer: Boundary, divider: Boundary, taper: Taper, variant: int) -> tuple[Boundary, Boundary]:
+    """Returns the outermost marking and the next one of a road whose outer lane ends (0, 1) or begins (2, 3).
 
-    Either the divider ends before the taper or begins after it (0, 2), or the edge ends or begins at the divider.
+    Either the divider ends before the taper or begins after it (0, 2), or the outermost one ends or begins at the
+    divider.
     """
-    inward = divider.u - edge.u
+    inward = divider.u - outer.u
     start, end = taper.start, taper.start + taper.length
     if variant == 0:
-        return replace(edge, taper=replace(taper, shift=inward)), replace(divider, last=start)
+        return replace(outer, taper=replace(taper, shift=inward)), replace(divider, last=start)
     if variant == 1:
-        return replace(edge, taper=replace(taper, shift=inward), last=end), divider
-    outward = replace(edge, u=divider.u, taper=replace(taper, shift=-inward))
+        return replace(outer, taper=replace(taper, shift=inward), last=end), divider
+    outward = replace(outer, u=divider.u, taper=replace(taper, shift=-inward))
     if variant == 2:
         return outward, replace(divider, first=end)
     return replace(outward, first=start), divider
@@ -341,7 +347,7 @@ def _disturbed(maker: _Maker, frames: int) -> tuple[Delivery, ...]:
 
 
 def _clutter(maker: _Maker) -> TrackingClip:
-    """Makes a drive on a road with seams, remains of old markings, repairs, shadows, words, curbs and traffic."""
+    """Makes a drive on a road with seams, remains of old markings, repairs, shadows, words, kerbs and traffic."""
     style: RoadStyle = "street" if maker.sampler.bernoulli(0.3) else maker.style()
     return _whole(TruePart(maker.drive(10.0, style, _cluttered, clutter=True)))
 
@@ -356,7 +362,7 @@ def _cluttered(scene: Scene) -> bool:
         surface.joints,
         len(surface.repairs) > 3,
         any(isinstance(shadow, LineShadow | TreeShadow) for shadow in scene.light.shadows),
-        scene.walls,
+        scene.walls or scene.kerbs,
         len(scene.traffic) > 5,
     )
     return bool(paintwork.ghosts) and sum(map(bool, clutter)) >= 6

@@ -7,15 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
-import cv2
 import numpy as np
 
 from lanestream_exporter.scenes.clip import write_frames
 from lanestream_exporter.scenes.lens import develop
 from lanestream_exporter.scenes.motion import Drift
 from lanestream_exporter.scenes.render import annotate, render_target
-from lanestream_exporter.scenes.render_target import SUBPIXEL_BITS, fixed_point
-from lanestream_exporter.scenes.traffic import NEAREST
+from lanestream_exporter.scenes.traffic import mark_covered
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
     from lanestream_exporter.datasets.labels import LabeledLane
     from lanestream_exporter.scenes.clip import Clip, ProgressCallback
     from lanestream_exporter.scenes.motion import SidewaysMove
-    from lanestream_exporter.scenes.projection import PinholeCamera, RoadProjection
+    from lanestream_exporter.scenes.projection import PinholeCamera
     from lanestream_exporter.scenes.render_target import RenderTarget
     from lanestream_exporter.scenes.road import Boundary
     from lanestream_exporter.scenes.scene import Scene
@@ -260,7 +258,7 @@ def _lanes(part: TruePart, frame: int, scene: Scene, target: RenderTarget) -> li
     whole = replace(scene, road=part.clip.scene.road)  # without gaps
     covered = target.hidden.copy()
     for vehicle in scene.traffic:
-        _cover(covered, target.projection, vehicle)
+        mark_covered(covered, target.projection, vehicle)
     lanes = []
     for lane in annotate(whole, target.projection, target.hidden, _LABEL_ROWS).lanes:
         index = lane.lane_id or 0
@@ -270,7 +268,7 @@ def _lanes(part: TruePart, frame: int, scene: Scene, target: RenderTarget) -> li
             {
                 "id": part.first_id + index,
                 "position": lane.position or 0,  # 0: has ended behind the vehicle or begins ahead of it
-                "type": lane.kind,
+                "type": lane.type,
                 "color": lane.color,
                 "points": lane.points.round(2).tolist(),
                 "paint": round(_visible_share(lane, covered, scene.camera.horizon), 3) if painted else 0.0,
@@ -287,18 +285,3 @@ def _visible_share(lane: LabeledLane, covered: Image, horizon: float) -> float:
     near = lane.points[lane.points[:, 1] >= horizon + _PAINT_SHARE * (height - 1.0 - horizon)]
     columns, rows = np.round(near if len(near) else lane.points).astype(int).T
     return float(np.mean(covered[rows, columns] == 0))
-
-
-def _cover(mask: Image, projection: RoadProjection, vehicle: Vehicle) -> None:
-    """Marks the outline of a vehicle's box in a mask (H, W)."""
-    nearest = projection.vehicle_s + NEAREST
-    if vehicle.s + vehicle.length < nearest + 1.0:
-        return
-    s, side, up = (
-        values.ravel()
-        for values in np.meshgrid([max(vehicle.s, nearest), vehicle.s + vehicle.length], [-0.5, 0.5], [0.0, 1.0])
-    )
-    u = vehicle.u + side * vehicle.width
-    if projection.to_vehicle(s, u)[0].max() <= projection.reach:  # not behind a crest
-        hull = cv2.convexHull(fixed_point(projection.project(s, u, up * vehicle.height)))
-        cv2.fillConvexPoly(mask, hull, (255.0,), cv2.LINE_8, SUBPIXEL_BITS)

@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import cv2
 import numpy as np
+
+from lanestream_exporter.scenes.render_target import SUBPIXEL_BITS, fixed_point
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lanestream.road.curve import FloatArray
+    from lanestream.road.view import Image
+    from lanestream_exporter.scenes.projection import RoadProjection
     from lanestream_exporter.scenes.render_target import RenderTarget
     from lanestream_exporter.scenes.surface import Color
 
@@ -189,3 +194,18 @@ def _draw_lights(box: _Box) -> None:
                 box.target.glow(box.points(lamp).mean(axis=0), reach, 0.8)
         else:
             box.fill(lamp, glow, 0.9)
+
+
+def mark_covered(mask: Image, projection: RoadProjection, vehicle: Vehicle) -> None:
+    """Marks the outline of a vehicle's box in a mask (H, W)."""
+    nearest = projection.vehicle_s + NEAREST
+    if vehicle.s + vehicle.length < nearest + 1.0:
+        return
+    s, side, up = (
+        values.ravel()
+        for values in np.meshgrid([max(vehicle.s, nearest), vehicle.s + vehicle.length], [-0.5, 0.5], [0.0, 1.0])
+    )
+    u = vehicle.u + side * vehicle.width
+    if projection.to_vehicle(s, u)[0].max() <= projection.reach:  # not behind a crest
+        hull = cv2.convexHull(fixed_point(projection.project(s, u, up * vehicle.height)))
+        cv2.fillConvexPoly(mask, hull, (255.0,), cv2.LINE_8, SUBPIXEL_BITS)

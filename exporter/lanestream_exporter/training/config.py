@@ -7,18 +7,20 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
+from lanestream.engine import resolve_regressor
 from lanestream_exporter.alexnet import Shape
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
 from lanestream_exporter.datasets.manifest import SHIPPED_MANIFEST
 from lanestream_exporter.samples.augment import Augmentation, Corruptions
 from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, Share, read_toml
+from lanestream_exporter.training.shipped import SHIPPED
 
 
 class AdamW(Section):
     """I. Loshchilov and F. Hutter, "Decoupled weight decay regularization", 2019."""
 
     kind: Literal["adamw"] = "adamw"
-    learning_rate: PositiveFloat = 6e-4
+    learning_rate: PositiveFloat = 8e-4
     weight_decay: Annotated[float, Field(ge=0.0)] = 0.02
 
 
@@ -50,14 +52,14 @@ class TrainConfig(Section):
     """What the runs of all networks have: steps, batch size, optimizer, schedule, initial weights.
 
     `ema` is the decay per step of the moving average of the weights, 0 for none; `clip` is the largest gradient norm,
-    0 for no limit. `initial` is the file of the weights to start from. All paths of the file count from the folder
-    that the command runs in.
+    0 for no limit. `initial` is the file of the weights to start from, or `shipped` for those of the shipped network.
+    All paths of the file count from the folder that the command runs in.
     """
 
     seed: NonNegativeInt = 1
-    steps: PositiveInt = 8000
+    steps: PositiveInt = 7000
     batch: Annotated[int, Field(ge=2)] = 96
-    check_every: PositiveInt = 800
+    check_every: PositiveInt = 700
     ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.998
     clip: Annotated[float, Field(ge=0.0)] = 5.0
     initial: str | None = None
@@ -88,18 +90,26 @@ class TrainingData(Section):
 
     Real frames are those of the `manifest`, a TOML file as `datasets.manifest` reads it; without it of the shipped one.
     `propagation_stride` also trains on every n-th frame between two labeled frames of a video, labeled by
-    `datasets.label_propagation`; 0 for none. `rendered_scenes` train and `validation_scenes` validate.
+    `datasets.label_propagation`; 0 for none. The data sets named in `without` are left out. `rendered_scenes` train and
+    `validation_scenes` validate. Of `hard_scenes` more, those train on which the detectors with the networks of
+    `committee`, the ONNX files of a classifier and of a regressor, disagree. `no_road_pictures` more show no road.
     """
 
     manifest: str | None = None
+    without: tuple[str, ...] = ()
     propagation_stride: NonNegativeInt = 5
-    rendered_scenes: NonNegativeInt = 4000
-    validation_scenes: PositiveInt = 50
-    real_share: Share = 0.25
+    rendered_scenes: NonNegativeInt = 5000
+    validation_scenes: PositiveInt = 100
+    no_road_pictures: NonNegativeInt = 0
+    hard_scenes: NonNegativeInt = 0
+    committee: tuple[str, str] | None = None
+    real_share: Share = 0.3
     final_real_share: Share = 0.5
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if (self.committee is None) != (self.hard_scenes == 0):
+            raise ValueError("hard_scenes and committee are only accepted together")
         if self.rendered_scenes == 0 and min(self.real_share, self.final_real_share) < 1.0:
             raise ValueError("without rendered scenes real_share and final_real_share must be 1")
         if self.manifest is not None and not self.has_real_frames:
@@ -120,10 +130,17 @@ class TrainingData(Section):
 class ClassifierData(TrainingData):
     """Where a classifier's patches come from.
 
-    `regressor` is an ONNX file: candidates are then proposed as when the two are served together.
+    `regressor` is an ONNX file, or `shipped`: candidates are then proposed as when the two are served together.
     """
 
     regressor: str | None = None
+
+    @property
+    def regressor_file(self) -> Path | None:
+        """The ONNX file of the regressor, if any."""
+        if self.regressor is None:
+            return None
+        return resolve_regressor(None) if self.regressor == SHIPPED else Path(self.regressor)
 
 
 class ClassifierConfig(TrainConfig):
@@ -138,17 +155,14 @@ class ClassifierConfig(TrainConfig):
 class RegressorData(TrainingData):
     """Where a regressor's frames come from."""
 
-    rendered_scenes: NonNegativeInt = 14000
+    rendered_scenes: NonNegativeInt = 12000
     validation_scenes: PositiveInt = 250
-    real_share: Share = 0.4
-    final_real_share: Share = 0.6
+    real_share: Share = 0.35
 
 
 class RegressorConfig(TrainConfig):
     """The configuration of a regressor run."""
 
-    steps: PositiveInt = 10000
-    check_every: PositiveInt = 1000
     batch: Annotated[int, Field(ge=2)] = 64
     network: NetworkSize = NetworkSize(size=224, width=0.5, hidden=1024)
     data: RegressorData = RegressorData()

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lanestream.errors import LabelError
 from lanestream.host import processors
+from lanestream.road.appearance import MARKING_COLORS, MARKING_TYPES
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.samples.cache import scenes_per_file
+from lanestream_exporter.samples.hard_scenes import Committee
 from lanestream_exporter.samples.patch_files import PatchCache, PatchStore, read_stores
-from lanestream_exporter.samples.road_frames import RoadFrame, read_frames, rendered_frames, road_frames
+from lanestream_exporter.samples.road_frames import RoadFrame, no_road_frames, read_frames, rendered_frames, road_frames
+from lanestream_exporter.samples.truth import MARKING, NOTHING, ROAD_EDGE
 from lanestream_exporter.training.config import TrainingData
 
 
@@ -19,7 +23,7 @@ from lanestream_exporter.training.config import TrainingData
 class PatchSource:
     """Patches of one kind, `rendered` or `real`: those to train on, and those that choose the best network.
 
-    Raises LabelError if either lacks true or false patches.
+    Raises LabelError if either lacks patches with or without a boundary.
     """
 
     name: str
@@ -28,19 +32,28 @@ class PatchSource:
 
     def __post_init__(self) -> None:
         for store, use in ((self.train, "train on"), (self.check, "validate with")):
-            for label, verdict in ((1, "true"), (0, "false")):
-                if not (store.labels == label).any():
-                    raise LabelError(f"there are no {verdict} {self.name} patches to {use}", "give more frames")
+            is_nothing = store.targets[:, 0] == NOTHING
+            for present, what in ((~is_nothing, "boundaries"), (is_nothing, "anything else")):
+                if not present.any():
+                    raise LabelError(f"no {self.name} patches of {what} to {use}", "give more frames")
 
     @property
-    def counts(self) -> dict[str, int]:
-        """The number of patches, and how many of them are true."""
-        return {
-            "train": len(self.train),
-            "train_true": int(self.train.labels.sum()),
-            "check": len(self.check),
-            "check_true": int(self.check.labels.sum()),
-        }
+    def counts(self) -> dict[str, Any]:
+        """The numbers of patches in all, of each kind, type and color, and of each data set."""
+        return {"train": _counts(self.train), "check": _counts(self.check)}
+
+
+def _counts(store: PatchStore) -> dict[str, Any]:
+    kinds, types, colors = store.targets.T
+    return {
+        "patches": len(store),
+        "nothing": int((kinds == NOTHING).sum()),
+        "marking": int((kinds == MARKING).sum()),
+        "road_edge": int((kinds == ROAD_EDGE).sum()),
+        **{name: int((types == index).sum()) for index, name in enumerate(MARKING_TYPES)},
+        **{name: int((colors == index).sum()) for index, name in enumerate(MARKING_COLORS)},
+        "sets": {name: int((store.sets == index).sum()) for index, name in enumerate(store.names)},
+    }
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,7 @@ def open_datasets(data: TrainingData, folder: Path | None) -> DatasetCollection 
     if not data.has_real_frames:
         return None
     datasets = DatasetCollection.open(None if data.manifest is None else Path(data.manifest), folder)
+    datasets = datasets.without(data.without)
     datasets.require_splits("train", "val")
     return datasets
 
@@ -100,8 +114,14 @@ def patch_files(
     if data.rendered_scenes:
         # The first file validates; the scenes of the others are trained on.
         scenes = [data.validation_scenes, *scenes_per_file(data.rendered_scenes)]
-        paths = cache.rendered(scenes, processors(), lambda more: done(more, sum(scenes)))
-        files.append(PatchFiles("rendered", tuple(paths[1:]), tuple(paths[:1])))
+        hard, no_road = scenes_per_file(data.hard_scenes), scenes_per_file(data.no_road_pictures)
+        total = sum(scenes) + sum(hard) + sum(no_road)
+        checked, *trained = cache.rendered(scenes, processors(), lambda more: done(more, total))
+        trained += cache.no_road(no_road, processors(), lambda more: done(more, total))
+        if data.committee is not None:
+            committee = Committee(*map(Path, data.committee))
+            trained += cache.hard(hard, committee, processors(), lambda more: done(more, total))
+        files.append(PatchFiles("rendered", tuple(trained), (checked,)))
     return files
 
 
@@ -119,7 +139,13 @@ def frame_sources(
         sources.append(RoadFrameSource("real", train, road_frames(datasets.frames("val"))))
     if data.rendered_scenes:
         scenes = [data.validation_scenes, *scenes_per_file(data.rendered_scenes)]
-        paths = rendered_frames(folder, scenes, processors(), lambda more: done(more, sum(scenes)))
-        frames = [frame for path in paths[1:] for frame in read_frames(path)]
-        sources.append(RoadFrameSource("rendered", frames, read_frames(paths[0])))
+        hard, no_road = scenes_per_file(data.hard_scenes), scenes_per_file(data.no_road_pictures)
+        total = sum(scenes) + sum(hard) + sum(no_road)
+        checked, *trained = rendered_frames(folder, scenes, processors(), lambda more: done(more, total))
+        trained += no_road_frames(folder, no_road, processors(), lambda more: done(more, total))
+        if data.committee is not None:
+            committee = Committee(*map(Path, data.committee))
+            trained += rendered_frames(folder, hard, processors(), lambda more: done(more, total), committee)
+        frames = [frame for path in trained for frame in read_frames(path)]
+        sources.append(RoadFrameSource("rendered", frames, read_frames(checked)))
     return sources

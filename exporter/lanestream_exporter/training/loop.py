@@ -14,15 +14,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 from lanestream.errors import SettingsError
 from lanestream.host import processors
-from lanestream_exporter.alexnet import load_state
 from lanestream_exporter.training.config import Cosine, Sgd, TrainConfig
 from lanestream_exporter.training.run_files import CurveRow, made_by, write_checkpoint, write_curve
+from lanestream_exporter.weight_files import load_state
 
 Batch = tuple[Tensor, ...]
 
@@ -100,6 +101,8 @@ class Run:
 
     def train(self, report: Callable[[TrainingProgress], None], stopped: Callable[[], bool]) -> None:
         """Trains to the end, or until `stopped` returns true after a step; the run is then saved and can be resumed."""
+        # The threads of OpenCV and of PyTorch wait for each other: with both, a step takes five times as long.
+        cv2.setNumThreads(1)
         for batch in self._batches():
             loss = self._train_step(batch)
             self._losses.append(loss)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,8 @@ from torch import Tensor, nn
 
 from lanestream.errors import CheckpointError
 from lanestream.road.crops import RoadCropGeometry
-from lanestream_exporter.alexnet import load_state, normalize
+from lanestream.road.curve import FloatArray
+from lanestream_exporter.alexnet import normalize
 from lanestream_exporter.regressor import LaneRegressor, RegressorPrediction, at_shares, lateral_loss
 from lanestream_exporter.samples.augment import corrupted
 from lanestream_exporter.samples.road_crops import SHARES, RegressionTarget, Warp, plain_warp, warped_road_crop
@@ -21,6 +21,8 @@ from lanestream_exporter.samples.road_frames import RoadFrame
 from lanestream_exporter.training.config import RegressorConfig
 from lanestream_exporter.training.data_sources import RoadFrameSource
 from lanestream_exporter.training.loop import SELECTED_BY, Batch
+from lanestream_exporter.training.shipped import initial_weights
+from lanestream_exporter.weight_files import load_state, weights_in
 
 # The rows at which lateral errors are reported: about 10 m and 30 m ahead of a typical dash camera.
 _REPORTED = {"10m": SHARES.index(0.37), "30m": SHARES.index(0.12)}
@@ -41,6 +43,7 @@ class RegressorTask:
     ) -> None:
         self._config = config
         self._sources = {source.name: source for source in sources}
+        self._chances = {source.name: frame_chances(source.train) for source in sources}
         self._geometry = RoadCropGeometry(config.network.size)
         self._checks = {source.name: self._unwarped(source.check) for source in sources}
         self.network = network
@@ -55,7 +58,7 @@ class RegressorTask:
         real = round(config.batch * share)
         samples: list[tuple[NDArray[np.uint8], RegressionTarget]] = []
         for name, count in (("real", real), ("rendered", config.batch - real)):
-            frames = draw_frames(self._sources[name].train, count, rng) if count else []
+            frames = self._draw(name, count, rng) if count else []
             samples += [warped_road_crop(frame, self._geometry, Warp.random(rng)) for frame in frames]
         crops = np.stack([corrupted(crop, config.corruptions, rng) for crop, _ in samples])
         return torch.from_numpy(crops), *_stacked([target for _, target in samples])
@@ -76,7 +79,13 @@ class RegressorTask:
             figures[f"{name}_loss"] = losses[-1]
             for distance, error in lateral_errors(prediction, named).items():
                 figures[f"{name}_px_{distance}"] = error
+            for field in ("presence", "road_edge"):
+                figures[f"{name}_{field}_accuracy"] = _share_right(getattr(prediction, field), named[field])
         return {SELECTED_BY: sum(losses) / len(losses), **figures}
+
+    def _draw(self, name: str, count: int, rng: np.random.Generator) -> list[RoadFrame]:
+        frames = self._sources[name].train
+        return [frames[int(i)] for i in rng.choice(len(frames), size=count, p=self._chances[name])]
 
     def _unwarped(self, frames: Sequence[RoadFrame]) -> Batch:
         """Returns the crops of frames as served: with the horizon known, and unknown as at the start of a stream."""
@@ -96,29 +105,37 @@ def lateral_errors(prediction: RegressorPrediction, targets: dict[str, Tensor]) 
     return {distance: float(error[:, :, i][known[:, :, i]].mean()) for distance, i in _REPORTED.items()}
 
 
-def draw_frames(frames: Sequence[RoadFrame], count: int, rng: np.random.Generator) -> list[RoadFrame]:
-    """Returns `count` random frames. Drives are weighted by the square root of their length, so that none dominates."""
-    groups = np.array([frame.group for frame in frames])
-    _, index, sizes = np.unique(groups, return_inverse=True, return_counts=True)
-    shares = 1.0 / np.sqrt(sizes[index])
-    return [frames[int(i)] for i in rng.choice(len(frames), size=count, p=shares / shares.sum())]
+def _share_right(logits: Tensor, truth: Tensor) -> float:
+    """Returns the share of logits with the right sign where the truth, 0 or 1, is known; it is -1 where it is not."""
+    known = truth >= 0.0
+    return float(((logits[known] > 0.0) == (truth[known] > 0.5)).float().mean())
+
+
+def frame_chances(frames: Sequence[RoadFrame]) -> FloatArray:
+    """Returns the chances (N,) with which frames are drawn.
+
+    Data sets, and the drives within each, count by the square root of their numbers of frames, so that none dominates.
+    """
+    _, sets, set_sizes = np.unique([frame.dataset for frame in frames], return_inverse=True, return_counts=True)
+    _, drives, drive_sizes = np.unique([frame.group for frame in frames], return_inverse=True, return_counts=True)
+    within = 1.0 / np.sqrt(drive_sizes[drives])
+    chances = np.sqrt(set_sizes)[sets] * within / np.bincount(sets, within)[sets]
+    return np.asarray(chances / chances.sum())
 
 
 def starting_regressor(config: RegressorConfig) -> LaneRegressor:
     """Returns the network before its first step: random by the seed, with the convolutions of `initial` if given.
 
-    `initial` is the checkpoint of a regressor or classifier run. Raises CheckpointError if it is neither.
+    `initial` is the checkpoint of a regressor or classifier run, or `shipped`. Raises CheckpointError for other files.
     """
     torch.manual_seed(config.seed)
     network = LaneRegressor(config.network.shape)
     if config.initial is None:
         return network
-    state = load_state(Path(config.initial)).get("network")
+    state = weights_in(load_state(initial_weights(config.initial, "regressor")))
     wanted = network.state_dict()
     convolutions = [key for key in wanted if key.startswith(("features", "norms"))]
-    if not isinstance(state, dict) or any(
-        key not in state or state[key].shape != wanted[key].shape for key in convolutions
-    ):
+    if any(key not in state or state[key].shape != wanted[key].shape for key in convolutions):
         hint = "give the best.pt of a classifier or regressor run with the same [network] width"
         raise CheckpointError(f"{config.initial} does not hold the convolutions of this network", hint)
     fitting = {key: value for key, value in state.items() if key in wanted and value.shape == wanted[key].shape}
@@ -131,7 +148,7 @@ def _normalized(crops: Tensor) -> Tensor:
     return normalize(crops).contiguous(memory_format=torch.channels_last)
 
 
-_FIELDS = ("columns", "known", "presence", "horizon")
+_FIELDS = ("columns", "known", "presence", "road_edge", "horizon")
 
 
 def _stacked(targets: Sequence[RegressionTarget]) -> tuple[Tensor, ...]:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from lanestream import __version__
 from lanestream.errors import CheckpointError
-from lanestream_exporter.alexnet import load_state
+from lanestream_exporter.weight_files import load_state
 
 CurveRow = dict[str, float]
 

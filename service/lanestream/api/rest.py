@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
@@ -14,15 +14,17 @@ from pydantic import BaseModel
 from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
 from lanestream.api.service import Service
-from lanestream.errors import NotAcceptableError, one_line
+from lanestream.errors import NotAcceptableError, ProtocolError, one_line
 from lanestream.images.decoding import decode
 from lanestream.logs import dropped_records
 from lanestream.messages import lanes_message
 from lanestream.protocol import (
+    BoundaryKind,
     CameraHeight,
     CameraModel,
     DetectorName,
     FieldOfView,
+    Horizon,
     LanesMessage,
     StartMessage,
     parse_camera,
@@ -31,6 +33,7 @@ from lanestream.streaming.session_registry import Caller
 from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
+    from fastapi.dependencies.models import Dependant
     from starlette.types import Receive, Scope, Send
 
     from lanestream.api.byte_budget import Charge
@@ -38,10 +41,27 @@ if TYPE_CHECKING:
     from lanestream.streaming.session_registry import OpenSession
     from lanestream.workers.capabilities import DetectorInfo
 
+
+def known_fields(request: Request) -> None:
+    """Raises ProtocolError if the URL has a query field that its route does not know: it is probably misspelled."""
+    known = list(_query_fields(request.scope["route"].dependant))
+    for name in request.query_params:
+        if name not in known:
+            accepted = f"{', '.join(known)} are accepted" if known else "none is accepted here"
+            raise ProtocolError(f"unknown query field {one_line(repr(name), 80)}", accepted)
+
+
+def _query_fields(dependant: Dependant) -> Iterator[str]:
+    """Yields the names of the query fields of a route and of what it depends on."""
+    yield from (field.alias for field in dependant.query_params)
+    for dependency in dependant.dependencies:
+        yield from _query_fields(dependency)
+
+
 # Open to everyone: health checks, and documents that are public anyway.
 public_router = APIRouter()
 # Behind the authenticator.
-router = APIRouter()
+router = APIRouter(dependencies=[Depends(known_fields)])
 # For the callers that the setting `metrics_access` allows.
 metrics_router = APIRouter()
 
@@ -171,10 +191,15 @@ async def detect(
     caller: Annotated[Caller, Depends(authenticated)],
     camera: Annotated[CameraModel | None, Depends(_camera)],
     horizon: Annotated[
-        float | None, Query(gt=0.0, lt=1.0, description="Row of the horizon as a fraction of the image height.")
+        Horizon | None,
+        Query(description="Row of the horizon as a fraction of the image height, negative above the image."),
     ] = None,
     detector: Annotated[
         DetectorName | None, Query(description="The detector that finds the lanes; the service's default if missing.")
+    ] = None,
+    kinds: Annotated[
+        list[BoundaryKind] | None,
+        Query(description="A kind of boundaries to report, repeated for several; the service's setting if missing."),
     ] = None,
 ) -> Response:
     """Returns the lanes of one image, sent as the body or as a form file: as JSON, or drawn on it, by `Accept`."""
@@ -184,7 +209,8 @@ async def detect(
     media_type = _response_media_type(request, service)
     # Requests that fail anyway are refused before their body is read, and a slow body does not occupy a session.
     pool.capabilities.select(detector)
-    start = StartMessage(horizon=horizon, detector=detector, camera=camera)
+    chosen = None if kinds is None else tuple(kinds)
+    start = StartMessage(horizon=horizon, detector=detector, camera=camera, kinds=chosen)
     options = service.session_options(start)
     service.sessions.check_limits(caller)
     with service.answering(request, caller):

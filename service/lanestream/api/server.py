@@ -27,6 +27,7 @@ from lanestream.api.websocket_connection import WebSocketConnection
 from lanestream.errors import SettingsError
 from lanestream.host import keep_freed_memory, raise_open_files, return_freed_memory
 from lanestream.logs import flush_logs, log_config
+from lanestream.packages import package_conflicts
 from lanestream.workers.ipc import WorkerSetup
 from lanestream.workers.process_pool import ProcessPool
 from lanestream.workers.thread_pool import ThreadPool
@@ -154,6 +155,8 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     host, port = listener.getsockname()[:2]
     warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
+    for conflict in package_conflicts():
+        _log.warning("%s", conflict)
     _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
     starting = asyncio.create_task(_start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)

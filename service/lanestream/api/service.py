@@ -121,7 +121,12 @@ class Service:
             # The client's own horizon counts more than the pitch of the service's default camera.
             camera = camera.model_copy(update={"pitch": None})
         return SessionOptions.of(
-            message.horizon, message.detector, camera, message.departure, self.settings.departure_settings
+            message.horizon,
+            message.detector,
+            camera,
+            message.departure,
+            self.settings.departure_settings,
+            message.kinds or self.settings.kinds,
         )
 
     def install(self, pool: WorkerPool) -> None:

@@ -10,9 +10,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.detection.classification import Classification
 from lanestream.detection.curve_fit import USUAL_OBLIQUITY, fit_curves
 from lanestream.detection.ego_prior import RoadRegressor
-from lanestream.detection.features import paint_gray
+from lanestream.detection.features import Channels
 from lanestream.detection.interface import Detections, FrameContext, Infer
 from lanestream.detection.patches import cut_patches
 from lanestream.detection.proposals import (
@@ -28,9 +29,6 @@ from lanestream.road.curve import ANCHORS, Curves, FloatArray
 from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_spans
 
-# The column of the classifier's outputs that holds the probability of a boundary.
-BOUNDARY: Final = 1
-
 # Distances between candidates are compared at these shares of the depth.
 _COMPARED: Final = np.array([0.25, 0.5, 1.0])
 # Candidates whose largest distance is at most _SAME, in row offsets, follow the same marking. The position of a marking
@@ -40,8 +38,10 @@ _AVERAGED: Final = 0.25
 # The prior's boundaries are fitted to the paint and become candidates too, except within this distance, in row offsets,
 # of a tracked boundary, which is on the paint already.
 _TRACKED: Final = 0.16
-# If two boundaries come closer than this, in row offsets, or cross, one of them is wrong.
+# If two boundaries come closer than this, in row offsets, or cross, one of them is wrong. An edge of the road may be
+# closer to a marking.
 _CLOSEST: Final = 0.8
+_CLOSEST_EDGE: Final = 0.2
 
 
 @dataclass(frozen=True)
@@ -54,58 +54,56 @@ class CandidateDetector:
 
     def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
         """Returns the boundaries in a BGR working image (H, 640, 3) uint8."""
-        gray = paint_gray(image)
-        proposals = self.propose(image, gray, context, infer)
+        proposals = self.propose(image, context, infer)
         patches = cut_patches(image, proposals.curves, proposals.spans, proposals.view, self.patch)
-        outputs = infer("classifier", patches)
-        return self.decide(gray, proposals, outputs)
+        return self.decide(proposals, Classification.of(infer("classifier", patches)))
 
-    def propose(
-        self, image: Image, gray: Image, context: FrameContext, infer: Infer, limit: int = MOST_CANDIDATES
-    ) -> Proposals:
-        """Returns the candidates of a BGR working image; `gray` is its `paint_gray`."""
+    def propose(self, image: Image, context: FrameContext, infer: Infer, limit: int = MOST_CANDIDATES) -> Proposals:
+        """Returns the candidates of a BGR working image."""
+        channels = Channels.of(image)
         if self.regressor is None:
-            return propose(gray, context, None, None, limit)
-        horizon = context.horizon if context.prior_horizon is None else context.prior_horizon
-        output, view = self.regressor.predict(image, horizon, infer)
+            return propose(channels, context, None, None, limit)
+        output, view = self.regressor.predict(image, context.expected_horizon, infer, is_given=context.is_given)
         prior = self.regressor.prior(output, view)
         sides: Sequence[int] = (0, 1)
         if context.tracked is not None:
             is_tracked = are_duplicates(output.curves(view), context.tracked, view, _TRACKED)
             sides = np.flatnonzero(~is_tracked.any(axis=1)).tolist()
-        _, fits = fit_output(gray, output, view, self.regressor.threshold, sides)
-        return propose(gray, context, prior, fits.curves, limit)
+        _, fits = fit_output(channels, output, view, self.regressor.threshold, sides)
+        return propose(channels, context, prior, fits.curves, limit)
 
     @staticmethod
-    def probabilities(proposals: Proposals, outputs: NDArray[np.float32]) -> FloatArray:
-        """Returns how likely each candidate (N,) is a boundary: the classifier's probability and the prior's odds."""
-        probability = outputs[:, BOUNDARY].astype(np.float64)
-        if proposals.prior is None:
-            return probability
-        odds = proposals.prior.odds(proposals.curves)
-        return np.asarray(probability * odds / (1.0 - probability + probability * odds))
+    def with_prior(proposals: Proposals, classification: Classification) -> Classification:
+        """Returns the classification of the candidates after the prior has changed the odds of their kinds."""
+        prior = proposals.prior
+        return classification if prior is None else classification.with_odds(prior.odds(proposals.curves))
 
-    def decide(self, gray: Image, proposals: Proposals, outputs: NDArray[np.float32]) -> Detections:
-        """Returns the boundaries among `proposals`, given the classifier's outputs (N, 2) for their patches.
+    def decide(self, proposals: Proposals, classification: Classification) -> Detections:
+        """Returns the boundaries among `proposals`, given the `classification` of their patches.
 
         The prior influences which candidates are accepted. Their exact position depends on the classifier alone, which
         is more precise.
         """
         started = time.perf_counter()
-        own = outputs[:, BOUNDARY].astype(np.float64)
-        probability = self.probabilities(proposals, outputs)
+        own, decided = classification.boundary, self.with_prior(proposals, classification)
+        probability = decided.boundary
         order = np.argsort(-own, kind="stable")
         accepted = order[probability[order] >= self.threshold]
-        prior_horizon = None if proposals.prior is None else proposals.prior.view.horizon
+        prior = proposals.prior
+        prior_horizon = None if prior is None else prior.view.horizon
         if not len(accepted):
             return Detections((), proposals.view, proposals.horizon_weight, prior_horizon)
         curves, spans = proposals.curves.take(accepted), proposals.spans.take(accepted)
         gaps = np.abs(_gaps(curves, proposals.view)).max(axis=2)
         chosen = non_maximum_suppression(gaps <= _SAME)
-        means = _means(curves, own[accepted], gaps, chosen, proposals.view)
-        fits = fit_curves(gray, means, spans.take(chosen), proposals.view)
+        near = own[accepted] ** 8 * (gaps[chosen] <= _SAME)
+        appearances = decided.take(accepted).appearances(near)
+        is_edge = np.array([appearance.kind == "road_edge" for appearance in appearances])
+        kinds = decided.kinds[accepted]
+        is_alike = is_edge[:, None] == (kinds[:, 1] > kinds[:, 0])
+        means = _means(curves, own[accepted] ** 8 * is_alike, gaps, chosen, proposals.view)
+        fits = fit_curves(proposals.channels, means, spans.take(chosen), proposals.view, is_edge=is_edge)
         visible = visible_spans(fits.curves, fits.view)
-        prior = proposals.prior
         expected = np.zeros(len(chosen), bool) if prior is None else prior.expects(curves.take(chosen))
         detections = [
             Detection(
@@ -116,6 +114,7 @@ class CandidateDetector:
                 p,
                 float(fits.paint[i]),
                 expected=bool(expected[i]),
+                appearance=appearances[i],
             )
             for i, p in enumerate(probability[accepted[chosen]].tolist())
             if visible.visible[i]
@@ -125,17 +124,16 @@ class CandidateDetector:
         return Detections(boundaries, fits.view, proposals.horizon_weight, prior_horizon, fit_s)
 
 
-def _means(
-    curves: Curves, probability: FloatArray, gaps: FloatArray, chosen: NDArray[np.intp], view: RoadView
-) -> Curves:
+def _means(curves: Curves, weights: FloatArray, gaps: FloatArray, chosen: NDArray[np.intp], view: RoadView) -> Curves:
     """Returns the weighted mean of each chosen candidate and all candidates close to it.
 
-    Their errors are largely independent. Less probable candidates have less weight.
+    Their errors are largely independent. `weights` (M, N) are low for less probable candidates, and zero for those of
+    the other kind.
     """
     rows = view.horizon + ANCHORS * view.depth
     slope = curves.take(chosen).slope(rows[1:2])[:, 0]
     obliquity = np.maximum(1.0, np.hypot(1.0, slope) / USUAL_OBLIQUITY)
-    weights = (gaps[chosen] <= _AVERAGED * obliquity[:, None]) * probability**8
+    weights = weights * (gaps[chosen] <= _AVERAGED * obliquity[:, None])
     return Curves.through(view.horizon, rows, weights @ curves.x(rows) / weights.sum(axis=1, keepdims=True))
 
 
@@ -148,7 +146,9 @@ def _separated(detections: list[Detection], view: RoadView) -> tuple[Detection, 
         return ()
     gaps = _gaps(Curves.of([detection.curve for detection in detections]), view)
     on_one_side = (gaps > 0.0).all(axis=2) | (gaps < 0.0).all(axis=2)
-    kept = non_maximum_suppression(~on_one_side | (np.abs(gaps).min(axis=2) <= _CLOSEST))
+    is_edge = np.array([detection.appearance.kind == "road_edge" for detection in detections])
+    closest = np.where(is_edge[:, None] == is_edge, _CLOSEST, _CLOSEST_EDGE)
+    kept = non_maximum_suppression(~on_one_side | (np.abs(gaps).min(axis=2) <= closest))
     return tuple(sorted((detections[i] for i in kept.tolist()), key=lambda each: float(each.curve.x(view.bottom))))
 
 

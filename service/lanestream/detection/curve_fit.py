@@ -1,15 +1,15 @@
 """The joint curve fit: moves all boundaries of a frame onto their paint together, to a fraction of a pixel.
 
-The marking filter finds bright bars row by row on a strip along each curve, and reweighted least squares pulls the
-curve onto them. Where paint is missing, two priors apply: the curve itself, and the road that it shares with the other
-boundaries. On a flat road all boundaries have one vanishing point, one horizon and one curvature. So a dashed line
-keeps its direction, and a far end behind a car follows its neighbors. A fit on one stripe of a double line is moved to
-the middle between both stripes.
+The marking filter finds bright bars row by row on a strip along each curve, and steps between two surfaces along edges
+of the road; reweighted least squares pulls the curve onto them. Where paint is missing, two priors apply: the curve
+itself, and the road that it shares with the other boundaries. On a flat road all boundaries have one vanishing point,
+one horizon and one curvature. So a dashed line keeps its direction, and a far end behind a car follows its neighbors. A
+fit on one stripe of a double line is moved to the middle between both stripes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import Final
@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanestream.detection.marking_filter import bar_contrast
+from lanestream.detection.features import Channels
+from lanestream.detection.marking_filter import bar_contrast, step_contrast
 from lanestream.road.curve import ANCHORS, Curves, FloatArray
 from lanestream.road.view import Image, RoadView, Spans, visible_spans
 
@@ -28,6 +29,8 @@ USUAL_OBLIQUITY: Final = 1.6
 
 # All widths are shares of the row offset, as everything on the road is. Markings are about as wide as one of these.
 _MARKING_WIDTHS: Final = (0.05, 0.1, 0.17)
+# The width of each side of a step.
+_STEP_WIDTH: Final = 0.08
 # Rows of a strip, from the bottom up to this share of the depth.
 _ROWS: Final = 48
 _TOP_SHARE: Final = 0.06
@@ -75,7 +78,7 @@ class FitSettings:
 class Fits:
     """Fitted curves, the covariances (N, 3, 3) of their coefficients, and the view with the horizon they agree on.
 
-    `paint` (N,) is the share of each curve's rows in which it lies on a marking.
+    `paint` (N,) is the share of each curve's rows in which it lies on a marking, or on a step if it is a road edge.
     """
 
     curves: Curves
@@ -85,29 +88,37 @@ class Fits:
 
 
 def fit_curves(
-    gray: Image,
+    channels: Channels,
     curves: Curves,
     spans: Spans,
     view: RoadView,
     settings: FitSettings = FitSettings(),
     sigma: FloatArray | None = None,
     anchors: FloatArray = ANCHORS,
+    is_edge: NDArray[np.bool_] | None = None,
 ) -> Fits:
-    """Fits `curves` to the paint in a gray working image, in the rows where they are visible, or else in their `spans`.
+    """Fits `curves` to a working image, in the rows where they are visible, or else in their `spans`.
 
+    Those that are road edges by the mask `is_edge` (N,) are fitted to steps between surfaces, all others to paint.
     `sigma` (N, 3) are the deviations in pixels of the curves' columns at the `anchors`, if known.
     """
     if not len(curves):
         return Fits(curves, np.empty((0, 3, 3)), np.empty(0), view)
+    is_edge = np.zeros(len(curves), bool) if is_edge is None else is_edge
     visible = visible_spans(curves, view, _TOP_SHARE)
     top = np.where(visible.visible, visible.top, spans.top)
     bottom = np.where(visible.visible, visible.bottom, spans.bottom)
     strips = _Strips.along(curves, top, bottom, view, settings.reach, settings.cells, _ROWS)
-    bars = strips.bars(gray, _MARKING_WIDTHS)
+    bars = strips.bars(channels.paint, _MARKING_WIDTHS)
+    if is_edge.any():
+        bars[is_edge] = strips.take(is_edge).steps(channels)
     if sigma is None:
         sigma = strips.obliquity[:, None] * _CANDIDATE_SIGMA * view.depth
     fits = _JointFit(strips, bars, curves, view, sigma, anchors).run(settings)
-    return replace(fits, curves=_between_stripes(gray, fits, top, bottom))
+    shifts = np.where(is_edge, 0.0, _stripe_shifts(channels.paint, fits, top, bottom))
+    # A shift proportional to the row offset is a constant shift on the ground.
+    moved = fits.curves.coefficients + shifts[:, None] * np.array([0.0, 1.0, 0.0])
+    return replace(fits, curves=Curves(fits.curves.horizon, moved))
 
 
 @dataclass(frozen=True)
@@ -133,8 +144,28 @@ class _Strips:
         across = np.linspace(-reach, reach, cells, dtype=np.float32)
         return cls(y, curves.x(y), y - view.horizon, obliquity, across)
 
+    def take(self, mask: NDArray[np.bool_]) -> _Strips:
+        return replace(self, y=self.y[mask], x=self.x[mask], u=self.u[mask], obliquity=self.obliquity[mask])
+
     def bars(self, gray: Image, widths: Sequence[float]) -> NDArray[np.float32]:
         """Returns the contrast (N, R, C), 0 to 1, of bars of the given widths."""
+        return self._relative(self._filtered(gray, widths, bar_contrast))
+
+    def steps(self, channels: Channels) -> NDArray[np.float32]:
+        """Returns the contrast (N, R, C), 0 to 1, of steps between two surfaces."""
+        contrast = [
+            self._filtered(channel, (_STEP_WIDTH,), lambda strip, widths: np.abs(step_contrast(strip, widths[0])))
+            for channel in (channels.paint, channels.blue)
+        ]
+        return self._relative(np.maximum(*contrast))
+
+    def _filtered(
+        self,
+        gray: Image,
+        widths: Sequence[float],
+        filtered: Callable[[Image, Sequence[int]], NDArray[np.float32]],
+    ) -> NDArray[np.float32]:
+        """Applies a filter for objects of the given `widths` to the strips (N, R, C)."""
         cells = len(self.across)
         reach = (self.u * self.obliquity[:, None]).astype(np.float32)
         columns = reach[:, :, None] * self.across
@@ -149,18 +180,22 @@ class _Strips:
         groups: dict[tuple[int, ...], list[int]] = {}
         for index, obliquity in enumerate(self.obliquity.tolist()):
             groups.setdefault(tuple(max(1, round(w / obliquity * per_cell)) | 1 for w in widths), []).append(index)
-        for bar_widths, members in groups.items():
-            filtered = bar_contrast(strips[members].reshape(-1, cells), bar_widths)
-            contrast[members] = filtered.reshape(len(members), -1, cells)
+        for cell_widths, members in groups.items():
+            part = filtered(strips[members].reshape(-1, cells), cell_widths)
+            contrast[members] = part.reshape(len(members), -1, cells)
+        return contrast
+
+    def _relative(self, contrast: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns a contrast in gray levels relative to the texture of its row and the strip's best rows, 0 to 1."""
         # A bar five gray levels above the texture of its row is visible to a person. Weights are squared, so that a few
         # bright dots outweigh a wheel track that is slightly lighter over its whole length.
         texture = np.abs(contrast).mean(axis=2, keepdims=True)
         rank = int((1.0 - _BEST_ROWS) * (self.y.shape[1] - 1))
         best = np.maximum(np.partition(contrast.max(axis=2), rank, axis=1)[:, rank], 0.0)
-        bars: NDArray[np.float32] = (contrast - texture) / (texture + (5.0 + _BEST_FACTOR * best)[:, None, None])
-        np.clip(bars, 0.0, 1.0, out=bars)
-        bars *= bars
-        return bars
+        relative: NDArray[np.float32] = (contrast - texture) / (texture + (5.0 + _BEST_FACTOR * best)[:, None, None])
+        np.clip(relative, 0.0, 1.0, out=relative)
+        relative *= relative
+        return relative
 
 
 class _JointFit:
@@ -319,8 +354,11 @@ _STRIPE_CONTRAST, _STRIPE_SHARE, _STRIPE_FARTHEST = 0.06, 0.3, 0.2
 _STRIPE_GAPS: Final = (0.07, 0.25)
 
 
-def _between_stripes(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArray) -> Curves:
-    """Returns the fitted curves; a curve on a stripe of a double line is moved to the middle between its stripes."""
+def _stripe_shifts(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArray) -> FloatArray:
+    """Returns how far (N,) fits on a stripe of a double line are left of the middle between its stripes, else 0.
+
+    The distances are in row offsets.
+    """
     view = fits.view
     visible = visible_spans(fits.curves, view, _STRIPE_TOP_SHARE)
     top = np.where(visible.visible, visible.top, top)
@@ -340,8 +378,7 @@ def _between_stripes(gray: Image, fits: Fits, top: FloatArray, bottom: FloatArra
         # The clearest stripe first.
         stripes = strips.across[cells[np.argsort(-mean[index, cells], kind="stable")]].tolist()
         shift[index] = _middle(stripes) * strips.obliquity[index]
-    # A shift proportional to the row offset is a constant shift on the ground.
-    return Curves(fits.curves.horizon, fits.curves.coefficients + shift[:, None] * np.array([0.0, 1.0, 0.0]))
+    return shift
 
 
 def _middle(stripes: Sequence[float]) -> float:

@@ -8,7 +8,7 @@ detector reports these boundaries; the candidate detector searches around them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -24,8 +24,13 @@ from lanestream.road.view import LANE_WIDTHS, USUAL_LANE_WIDTH, Image, RoadView,
 # The regressor gives columns at these shares of the depth below the horizon.
 REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
 
-# Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each.
-UNKNOWN_HORIZONS: Final = (0.32, 0.39, 0.46, 0.53, 0.6)
+# Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each. Neighbors differ by
+# about a sixth of the depth. A camera that looks down has its horizon above the picture.
+UNKNOWN_HORIZONS: Final = (-0.36, -0.16, 0.02, 0.17, 0.29, 0.39, 0.48, 0.57)
+# How far a given horizon moves with the vehicle's pitch, in depths.
+_MOST_PITCH: Final = 0.05
+# The limits of the horizon, as shares of the height.
+_HIGHEST_HORIZON, _LOWEST_HORIZON = -0.6, 0.9
 
 # If the mean sigma, in image widths, is above the first limit, the network also runs on the mirrored crop. A boundary
 # whose sigma is above the second limit is not used for the search: the network does not know such roads.
@@ -49,21 +54,24 @@ class RegressorOutput:
     """The regressor's output for one frame, relative to its road crop.
 
     `columns` (2, 3) and `sigma` (2, 3) of the left and the right boundary at the anchors are in image widths from the
-    middle; `presence` (2,) is from 0 to 1; `horizon` is in depths below where the crop assumed it.
+    middle; `presence` (2,) is the probability of each; `horizon` is in depths below where the crop assumed it.
+    `road_edge` (2,) is the probability of a boundary being an edge of the road rather than a marking; older networks
+    don't return it, and know only markings.
     """
-
-    SIZE = 15
 
     columns: FloatArray
     sigma: FloatArray
     presence: FloatArray
     horizon: float
+    road_edge: FloatArray
 
     @classmethod
     def of(cls, output: NDArray[np.float32]) -> RegressorOutput:
-        """Reads one row (15,) of the network's outputs."""
+        """Reads one row (17,) of the network's outputs, or (15,) of an older network's."""
         values = np.asarray(output, dtype=np.float64)
-        return cls(values[:6].reshape(2, 3), values[6:12].reshape(2, 3), values[12:14], float(values[14]))
+        columns, sigma, presence = values[:6].reshape(2, 3), values[6:12].reshape(2, 3), values[12:14]
+        road_edge = values[15:17] if len(values) > 15 else np.zeros(2)
+        return cls(columns, sigma, presence, float(values[14]), road_edge)
 
     @property
     def uncertainty(self) -> float:
@@ -73,7 +81,9 @@ class RegressorOutput:
     @property
     def mirrored(self) -> RegressorOutput:
         """The output of a mirrored crop, mirrored back."""
-        return RegressorOutput(-self.columns[::-1], self.sigma[::-1], self.presence[::-1], self.horizon)
+        return RegressorOutput(
+            -self.columns[::-1], self.sigma[::-1], self.presence[::-1], self.horizon, self.road_edge[::-1]
+        )
 
     def mean(self, other: RegressorOutput) -> RegressorOutput:
         """Returns the mean of two outputs for one crop."""
@@ -82,12 +92,14 @@ class RegressorOutput:
             0.5 * (self.sigma + other.sigma),
             0.5 * (self.presence + other.presence),
             0.5 * (self.horizon + other.horizon),
+            0.5 * (self.road_edge + other.road_edge),
         )
 
     def view(self, assumed: RoadView) -> RoadView:
         """Returns the view with the horizon where the network sees it."""
         horizon = assumed.horizon + self.horizon * assumed.depth
-        return assumed.with_horizon(float(np.clip(horizon, 0.0, 0.9 * assumed.height)))
+        limits = _HIGHEST_HORIZON * assumed.height, _LOWEST_HORIZON * assumed.height
+        return assumed.with_horizon(float(np.clip(horizon, *limits)))
 
     def curves(self, view: RoadView) -> Curves:
         """Returns both boundaries, left and right, in pixels of `view`, which has the network's horizon."""
@@ -100,7 +112,8 @@ class EgoPrior:
     """The ego boundaries that the regressor sees well enough, from left to right; none, one or two.
 
     `sides` are -1 (left) and +1 (right). `curves` are in pixels of the working image below the horizon of `view`, and
-    `sigma` (M, 2) in row offsets. `presence` (M,) is the probability that the boundary exists at all.
+    `sigma` (M, 2) in row offsets. `presence` (M,) is the probability that the boundary exists at all, and `road_edge`
+    (M,) that it is an edge of the road if it does.
     """
 
     view: RoadView
@@ -108,6 +121,7 @@ class EgoPrior:
     curves: Curves
     sigma: FloatArray
     presence: FloatArray
+    road_edge: FloatArray
 
     @property
     def vanishing_point(self) -> VanishingPoint:
@@ -131,24 +145,27 @@ class EgoPrior:
         return np.asarray((apart[:, likely].mean(axis=2) <= _EXPECTED).any(axis=1))
 
     def odds(self, curves: Curves) -> FloatArray:
-        """Returns the factors (N,) by which their positions change the odds of `curves` to be boundaries.
+        """Returns the factors (N, 2) by which their positions change the odds of `curves` to be markings or road edges.
 
-        Roads have a boundary every lane width. The ego lane has its boundaries where the prior saw them, within their
-        sigma (with the heavy tail of Student's t with three degrees of freedom), and none between them.
+        Roads have a marking every lane width, and edges anywhere outside the ego lane. The ego lane has its boundaries
+        where the prior saw them, within their sigma (with the heavy tail of Student's t with three degrees of freedom),
+        and none between them.
         """
         below = _COMPARED * self.view.depth
         rows = self.view.horizon + below
         positions = curves.x(rows) / below
         mine = self.curves.x(rows) / below
         distance = (positions[:, None] - mine) / self.sigma
-        odds = np.ones(len(curves))
+        odds = np.ones((len(curves), 2))
         if len(mine) == 2:
             inside = np.minimum(distance[:, 0].mean(axis=1), -distance[:, 1].mean(axis=1))
             left, right = mine.mean(axis=1).tolist()
             spacing = LaneSpacing(left, right, _UNSPACED_SHARE)
-            odds = _SPACED_ODDS * spacing.weight(positions.mean(axis=1)) / (1.0 + np.exp(inside.clip(-30.0, 30.0)))
+            odds[:, 0] = _SPACED_ODDS * spacing.weight(positions.mean(axis=1))
+            odds /= (1.0 + np.exp(inside.clip(-30.0, 30.0)))[:, None]
         density = 2.0 / (np.pi * np.sqrt(3.0)) / (1.0 + (distance**2).mean(axis=2) / 3.0) ** 2 / self.sigma.mean(axis=1)
-        return np.asarray(odds + USUAL_LANE_WIDTH * density @ self.presence)
+        kinds = self.presence[:, None] * np.stack([1.0 - self.road_edge, self.road_edge], axis=1)
+        return np.asarray(odds + USUAL_LANE_WIDTH * density @ kinds)
 
 
 @dataclass(frozen=True)
@@ -198,11 +215,13 @@ class RoadRegressor:
     threshold: float
     geometry: RoadCropGeometry = RoadCropGeometry()
 
-    def predict(self, image: Image, horizon: float | None, infer: Infer) -> tuple[RegressorOutput, RoadView]:
+    def predict(
+        self, image: Image, horizon: float | None, infer: Infer, *, is_given: bool = False
+    ) -> tuple[RegressorOutput, RoadView]:
         """Returns the output for a BGR working image, and the view with the horizon that the network sees.
 
         `horizon` is its approximate row. If it is None, the network runs once for each of several rows, and again near
-        the one with the least uncertainty.
+        the one with the least uncertainty. If it `is_given`, it is wrong only by the vehicle's pitch.
         """
         height, width = image.shape[:2]
         detail = resized(image, self.geometry.detail_width / width)
@@ -212,13 +231,15 @@ class RoadRegressor:
             outputs = [RegressorOutput.of(row) for row in infer("regressor", crops)]
             best = min(range(len(views)), key=lambda i: outputs[i].uncertainty)
             horizon = outputs[best].view(views[best]).horizon
-        view = RoadView(width, height, float(np.clip(horizon, 0.0, 0.85 * height)))
+        view = RoadView(width, height, float(np.clip(horizon, _HIGHEST_HORIZON * height, 0.85 * height)))
         crop = self.crop(detail, view)
         output = RegressorOutput.of(infer("regressor", crop[None])[0])
         if output.sigma.mean() > _UNCERTAIN:
             # The network's errors differ between a crop and its mirror image, so their mean is the better estimate.
             mirrored = RegressorOutput.of(infer("regressor", np.ascontiguousarray(crop[None, :, ::-1]))[0]).mirrored
             output = output.mean(mirrored)
+        if is_given:
+            output = replace(output, horizon=float(np.clip(output.horizon, -_MOST_PITCH, _MOST_PITCH)))
         return output, output.view(view)
 
     def crop(self, detail: Image, view: RoadView) -> NDArray[np.uint8]:
@@ -233,7 +254,12 @@ class RoadRegressor:
         sigma = output.sigma[seen, : len(_COMPARED)] * view.width / (_COMPARED * view.depth)
         sides = _sides(seen.tolist())
         return EgoPrior(
-            view, sides, output.curves(view).take(seen), np.hypot(sigma, _LEAST_SIGMA), output.presence[seen]
+            view,
+            sides,
+            output.curves(view).take(seen),
+            np.hypot(sigma, _LEAST_SIGMA),
+            output.presence[seen],
+            output.road_edge[seen],
         )
 
 

@@ -1,4 +1,4 @@
-"""Edge pixels and their gradient directions: the votes of the extended Hough transform."""
+"""What boundaries are searched in: gray images of a frame, and its edge pixels with their gradient directions."""
 
 from __future__ import annotations
 
@@ -25,13 +25,23 @@ class Edges:
     weight: NDArray[np.float32]
 
 
-def paint_gray(image: Image) -> Image:
-    """Converts a BGR image (H, W, 3) to gray levels (H, W) in which white and yellow paint are both bright.
+@dataclass(frozen=True)
+class Channels:
+    """Two gray images (H, W) uint8 of a frame.
 
-    The gray level is the mean of green and red: yellow differs from concrete in blue, which luminance includes.
+    In `paint`, the mean of green and red, white and yellow paint are both bright: yellow differs from concrete in blue,
+    which luminance includes. In `blue`, grass and earth are darker than any asphalt.
     """
-    green, red = cv2.extractChannel(image, 1), cv2.extractChannel(image, 2)
-    return np.asarray(cv2.addWeighted(green, 0.5, red, 0.5, 0.0), dtype=np.uint8)
+
+    paint: Image
+    blue: Image
+
+    @classmethod
+    def of(cls, image: Image) -> Channels:
+        """Returns the channels of a BGR image (H, W, 3)."""
+        blue, green, red = (cv2.extractChannel(image, channel) for channel in range(3))
+        paint = np.asarray(cv2.addWeighted(green, 0.5, red, 0.5, 0.0), dtype=np.uint8)
+        return cls(paint, np.asarray(blue, dtype=np.uint8))
 
 
 def find_edges(gray: Image, top: int) -> Edges:
@@ -48,7 +58,8 @@ def find_edges(gray: Image, top: int) -> Edges:
     gain = 128.0 / (cv2.blur(magnitude, (63, 31)) + 24.0)
     edges = cv2.Canny((dx * gain).astype(np.int16), (dy * gain).astype(np.int16), 120, 280, L2gradient=True)
     points = cv2.findNonZero(edges)
-    columns, rows = np.empty((2, 0), np.int32) if points is None else points[:, 0].T
+    # OpenCV 4 returns (N, 1, 2), OpenCV 5 returns (N, 2).
+    columns, rows = np.empty((2, 0), np.int32) if points is None else points.reshape(-1, 2).T
     at = rows * edges.shape[1] + columns
     angle = np.degrees(np.arctan2(dy.take(at), dx.take(at))) % 360.0
     weight = np.minimum(magnitude.take(at) * gain.take(at) / 640.0, 1.0)

@@ -28,12 +28,18 @@ class FrameContext:
 
     `horizon` is its row, `tracked` are the boundaries of the last frame, and `prior_horizon` is the row that the
     ego-lane prior of the last frame gave; each is None if unknown. The prior's row is steadier, because it does not
-    depend on which boundaries are found.
+    depend on which boundaries are found. If `is_given`, the horizon is known from outside, except for pitch.
     """
 
     horizon: float | None = None
     tracked: Curves | None = None
     prior_horizon: float | None = None
+    is_given: bool = False
+
+    @property
+    def expected_horizon(self) -> float | None:
+        """The row at which the ego-lane prior is looked for; None if unknown."""
+        return self.horizon if self.is_given or self.prior_horizon is None else self.prior_horizon
 
 
 @dataclass(frozen=True)

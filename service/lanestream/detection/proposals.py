@@ -9,33 +9,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.ego_prior import EgoPrior
-from lanestream.detection.features import find_edges
+from lanestream.detection.features import Channels, find_edges
 from lanestream.detection.hough import HoughLines, hough_curves, hough_lines
 from lanestream.detection.interface import FrameContext
-from lanestream.detection.marking_filter import Ridges, find_ridges
+from lanestream.detection.marking_filter import Ridges, find_ridges, find_steps
 from lanestream.detection.vanishing_point import (
     KNOWN_HORIZON,
     NEAR_PRIOR,
     WIDE,
     find_lines,
+    find_step_lines,
     refine,
     vote_of_lines,
 )
 from lanestream.road.curve import Curves, FloatArray, VanishingPoint
-from lanestream.road.view import Image, RoadView, Spans, visible_spans
+from lanestream.road.view import RoadView, Spans, visible_spans
 
 # The most candidates of a frame, and of one in which boundaries are tracked: those come early, so fewer are needed.
 MOST_CANDIDATES: Final = 16
 MOST_WITH_TRACKS: Final = 12
+# Some of them are lines along steps between surfaces, with at least this strength: one in so many, and at most this
+# number in a frame in which boundaries are tracked.
+_LEAST_STEPS: Final = 0.1
+_PER_STEP: Final = 4
+_MOST_STEPS_WITH_TRACKS: Final = 2
 
 # Candidates closer than this, in row offsets, at both rows of _COMPARED (shares of the depth) are duplicates.
 _SEPARATION: Final = 0.05
 _COMPARED: Final = np.array([1.0, 0.45])
+# A step this close to a bright line, in row offsets, is the side of a marking.
+_SIDE: Final = 0.12
 # Lines weaker than this, relative to the strongest one, are hardly ever boundaries.
 _LEAST_STRENGTH: Final = 0.06
 # Lines far from the positions of the lane-spacing model keep this share of their strength.
 _UNSPACED_SHARE: Final = 0.3
-# A candidate is visible over at least this share of the depth.
+# A candidate is visible over at least this share of the depth. The far edge of a wide road is nearly level in the
+# image, so the length of such a line counts, whatever number of rows it crosses.
 _SHORTEST: Final = 0.15
 # A horizon below the first share of the height leaves no road to search. If the horizon is unknown, edges are used from
 # the second share down.
@@ -45,12 +54,13 @@ _HIGHEST_ROAD: Final = 0.42
 
 @dataclass(frozen=True)
 class Proposals:
-    """The candidates of a frame, best first, in pixels of the working image.
+    """The candidates of a frame, best first, in pixels of the working image with these `channels`.
 
     All `curves` (N) share the horizon of `view` and are visible within `spans`. `horizon_weight` (0 to 1) is how much
     the frame reveals about its horizon; `prior` is the ego-lane prior that guided the search, if any.
     """
 
+    channels: Channels
     curves: Curves
     spans: Spans
     view: RoadView
@@ -59,19 +69,20 @@ class Proposals:
 
 
 def propose(
-    gray: Image,
+    channels: Channels,
     context: FrameContext,
     prior: EgoPrior | None,
-    on_paint: Curves | None,
+    fitted: Curves | None,
     limit: int = MOST_CANDIDATES,
 ) -> Proposals:
-    """Returns the candidates of a gray working image (H, 640).
+    """Returns the candidates of a working image (H, 640).
 
     The boundaries of the `prior` and the next lanes beside them come first, then tracked boundaries, the prior's
-    boundaries after a fit to their paint (`on_paint`), and the lines found in the image, strongest first.
+    boundaries after a fit to the image (`fitted`), and the bright lines found in the image, strongest first; then lines
+    along steps between surfaces.
     """
-    height, width = gray.shape
-    road = _search_road(gray, context, prior)
+    height, width = channels.paint.shape
+    road = _search_road(channels, context, prior)
     point = road.point
     view = RoadView(width, height, point.y)
     lines = find_lines(road.ridges, point, width)
@@ -95,40 +106,62 @@ def propose(
     ranked = Curves.concatenate([*leading, found])
     chosen = non_maximum_suppression(are_duplicates(ranked, ranked, view))
     first = chosen < sum(len(curves) for curves in leading)
-    painted = (on_paint or Curves.none(point.y)).below(point.y, view.bottom)
-    painted = painted.take(np.flatnonzero(~are_duplicates(painted, tracked, view).any(axis=1)))
-    curves = Curves.concatenate([ranked.take(chosen[first]), painted, ranked.take(chosen[~first])])
-    spans = visible_spans(curves, view)
-    limit = min(limit, MOST_WITH_TRACKS) if len(tracked) else limit
-    kept = np.flatnonzero(spans.visible & (spans.bottom - spans.top >= _SHORTEST * view.depth))[:limit]
-    return Proposals(curves.take(kept), spans.take(kept), view, point.weight, prior)
+    fitted = (fitted or Curves.none(point.y)).below(point.y, view.bottom)
+    fitted = fitted.take(np.flatnonzero(~are_duplicates(fitted, tracked, view).any(axis=1)))
+    bright = Curves.concatenate([ranked.take(chosen[first]), fitted, ranked.take(chosen[~first])])
+    step_lines = find_step_lines(road.steps, point, width)
+    steps = point.curves(step_lines.positions[step_lines.strength >= _LEAST_STEPS])
+    every = Curves.concatenate([bright, steps])
+    spans = visible_spans(every, view)
+    is_tall = spans.visible & (spans.bottom - spans.top >= _SHORTEST * view.depth)
+    usable = np.flatnonzero(is_tall[: len(bright)])
+    limit, most_steps = (MOST_WITH_TRACKS, _MOST_STEPS_WITH_TRACKS) if len(tracked) else (limit, limit // _PER_STEP)
+    strongest, others = usable[: limit - most_steps], usable[limit - most_steps :]
+    along = len(bright) + np.flatnonzero(is_long(steps, spans.take(slice(len(bright), None)), view))
+    steps, lines_before = every.take(along), every.take(strongest)
+    is_known = are_duplicates(steps, lines_before, view) | _are_sides(steps, lines_before, view)
+    along = along[np.flatnonzero(~is_known.any(axis=1))[:most_steps]]
+    kept = np.concatenate([strongest, along, others[: most_steps - len(along)]])
+    return Proposals(channels, every.take(kept), spans.take(kept), view, point.weight, prior)
+
+
+def is_long(curves: Curves, spans: Spans, view: RoadView) -> NDArray[np.bool_]:
+    """Returns which curves (N,) are long enough, within their visible `spans`, for the edge of a road."""
+    ends = curves.x(np.stack([spans.top, spans.bottom], axis=1))
+    length = np.hypot(spans.bottom - spans.top, ends[:, 1] - ends[:, 0])
+    return np.asarray(spans.visible & (length >= _SHORTEST * view.depth))
 
 
 @dataclass(frozen=True)
 class _Road:
-    """The vanishing point of a frame, its ridges, and its Hough lines if no prior led to the vanishing point."""
+    """The vanishing point of a frame, its ridges and steps, and its Hough lines if no prior led to that point."""
 
     point: VanishingPoint
     ridges: Ridges
+    steps: Ridges
     hough: HoughLines | None = None
 
 
-def _search_road(gray: Image, context: FrameContext, prior: EgoPrior | None) -> _Road:
+def _search_road(channels: Channels, context: FrameContext, prior: EgoPrior | None) -> _Road:
     """Returns the vanishing point, near that of the prior, or else where the lines of the edges meet."""
-    height, width = gray.shape
+    height, width = channels.paint.shape
     if prior is not None and prior.sides:
-        ridges = find_ridges(gray, prior.vanishing_point)
-        return _Road(refine(prior.vanishing_point, ridges, width, height - 1.0, NEAR_PRIOR), ridges)
+        guess = prior.vanishing_point
+        ridges, steps = find_ridges(channels.paint, guess), find_steps(channels, guess)
+        # Between two edges of a road without markings, ridges are noise.
+        evidence = replace(steps, weight=np.abs(steps.weight)) if (prior.road_edge > 0.5).all() else ridges
+        return _Road(refine(guess, evidence, width, height - 1.0, NEAR_PRIOR), ridges, steps)
     horizon = context.horizon
     if horizon is not None:
         # A prior without boundaries, in the dark or in a sharp curve, still gives the horizon.
         horizon = min(horizon if prior is None else prior.view.horizon, _LOWEST_HORIZON * height)
     top = _HIGHEST_ROAD * height if horizon is None else horizon
-    lines = hough_lines(find_edges(gray, int(np.clip(top, 0, height - 16))), width, height - 1.0)
+    lines = hough_lines(find_edges(channels.paint, int(np.clip(top, 0, height - 16))), width, height - 1.0)
     guess = vote_of_lines(lines, width, height, horizon)
-    ridges = find_ridges(gray, guess)
+    ridges = find_ridges(channels.paint, guess)
     point = refine(guess, ridges, width, height - 1.0, WIDE if horizon is None else KNOWN_HORIZON)
-    return _Road(replace(point, y=min(point.y, _LOWEST_HORIZON * height)), ridges, lines)
+    point = replace(point, y=min(point.y, _LOWEST_HORIZON * height))
+    return _Road(point, ridges, find_steps(channels, point), lines)
 
 
 def _normalized(strength: FloatArray) -> FloatArray:
@@ -150,6 +183,13 @@ def are_duplicates(
     slope = (columns[:, 0] - columns[:, 1]) / (below[0] - below[1])
     limit = separation * below * np.hypot(1.0, slope)[:, None]
     return np.asarray((np.abs(curves.x(rows)[:, None] - columns) < limit).all(axis=2))
+
+
+def _are_sides(steps: Curves, bright: Curves, view: RoadView) -> NDArray[np.bool_]:
+    """Returns a mask (N, M): which of the steps are the sides of the markings along the bright lines."""
+    below = _COMPARED * view.depth
+    rows = view.horizon + below
+    return np.asarray((np.abs(steps.x(rows)[:, None] - bright.x(rows)) < _SIDE * below).all(axis=2))
 
 
 def non_maximum_suppression(conflicts: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -11,8 +11,9 @@ import numpy as np
 
 from lanestream.detection.curve_fit import Fits, FitSettings, fit_curves
 from lanestream.detection.ego_prior import REGRESSOR_ANCHORS, RegressorOutput, RoadRegressor
-from lanestream.detection.features import paint_gray
+from lanestream.detection.features import Channels
 from lanestream.detection.interface import Detections, FrameContext, Infer
+from lanestream.road.appearance import Appearance
 from lanestream.road.results import Detection
 from lanestream.road.view import Image, RoadView, visible_spans
 
@@ -31,9 +32,9 @@ class RegressionDetector:
 
     def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
         """Returns the ego boundaries in a BGR working image (H, 640, 3) uint8."""
-        output, view = self.regressor.predict(image, context.horizon, infer)
+        output, view = self.regressor.predict(image, context.horizon, infer, is_given=context.is_given)
         started = time.perf_counter()
-        sides, fits = fit_output(paint_gray(image), output, view, self.regressor.threshold)
+        sides, fits = fit_output(Channels.of(image), output, view, self.regressor.threshold)
         spans = visible_spans(fits.curves, fits.view)
         found = [
             Detection(
@@ -44,6 +45,7 @@ class RegressionDetector:
                 float(output.presence[side]),
                 float(fits.paint[index]),
                 expected=True,
+                appearance=Appearance(float(output.road_edge[side])),
             )
             for index, side in enumerate(sides)
             if spans.visible[index]
@@ -53,9 +55,9 @@ class RegressionDetector:
 
 
 def fit_output(
-    gray: Image, output: RegressorOutput, view: RoadView, threshold: float, sides: Sequence[int] = (0, 1)
+    channels: Channels, output: RegressorOutput, view: RoadView, threshold: float, sides: Sequence[int] = (0, 1)
 ) -> tuple[list[int], Fits]:
-    """Fits the present boundaries of an output (0 left, 1 right) among `sides` to the paint under them.
+    """Fits the present boundaries of an output (0 left, 1 right) among `sides` to the image under them.
 
     Returns the sides that were fitted, and their fits. `view` has the network's horizon.
     """
@@ -64,4 +66,14 @@ def fit_output(
     present = [side for side in sides if output.presence[side] >= threshold and spans.visible[side]]
     sigma = np.maximum(_SIGMA_FACTOR * view.width * output.sigma[present], _LEAST_SIGMA * view.depth)
     chosen = np.array(present, np.intp)
-    return present, fit_curves(gray, curves.take(chosen), spans.take(chosen), view, _FIT, sigma, REGRESSOR_ANCHORS)
+    fits = fit_curves(
+        channels,
+        curves.take(chosen),
+        spans.take(chosen),
+        view,
+        _FIT,
+        sigma,
+        REGRESSOR_ANCHORS,
+        is_edge=output.road_edge[chosen] > 0.5,
+    )
+    return present, fits

@@ -16,28 +16,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.detection.hough import HoughLines
-from lanestream.detection.marking_filter import REACH, STEP, Ridges
+from lanestream.detection.marking_filter import COARSE, REACH, STEP, Ridges
 from lanestream.road.curve import FloatArray, VanishingPoint
 
 # --- From Hough lines, if there is no prior -------------------------------------------------------------------------
 
 # A line supports a point with a Cauchy weight; this is its scale in image widths.
 _TOLERANCE: Final = 0.012
-# The horizon's row as a fraction of the height: its limits, where cameras usually have it, and the standard deviation.
+# The horizon's row as a fraction of the height: its usual limits, mean and standard deviation.
 _HIGHEST, _LOWEST, _USUAL, _SPREAD = 0.2, 0.72, 0.46, 0.16
 _GRID_COLUMNS: Final = 80
+# A camera that looks down has its horizon higher, up to this fraction. Half as many rows are tried there.
+_ABOVE: Final = -0.4
 
 
 def vote_of_lines(lines: HoughLines, width: int, height: int, horizon: float | None = None) -> VanishingPoint:
     """Returns the vanishing point of `lines` in a `width` x `height` image, on the row `horizon` if that is known.
 
-    All lines vote over a grid of points; weighted least squares then refines the winner.
+    All lines vote over a grid of points; weighted least squares then refines the winner. The row is negative if the
+    point is above the image.
     """
     if len(lines) < 2:
         return VanishingPoint((width - 1) / 2.0, _USUAL * height if horizon is None else horizon)
     step = width / _GRID_COLUMNS
     columns = np.arange(0.1 * width, 0.9 * width, step)
-    rows = np.arange(_HIGHEST * height, _LOWEST * height, step) if horizon is None else np.array([horizon])
+    if horizon is None:
+        above = np.arange(_ABOVE * height, _HIGHEST * height, 2.0 * step)
+        rows = np.concatenate([above, np.arange(_HIGHEST * height, _LOWEST * height, step)])
+    else:
+        rows = np.array([horizon])
     support = _support(lines, columns, rows, width, height - 1.0)
     usual = ((columns / width - 0.5) / 0.25)[None, :] ** 2
     if horizon is None:
@@ -48,7 +55,8 @@ def vote_of_lines(lines: HoughLines, width: int, height: int, horizon: float | N
     weight = float(np.clip(2.0 * support[best] / lines.votes.sum(), 0.0, 1.0))
     for _ in range(3):
         x, y = _least_squares_step(lines, x, y, width, height - 1.0, horizon is not None)
-    y = float(np.clip(y, _HIGHEST * height, _LOWEST * height))
+    if horizon is None:
+        y = float(np.clip(y, _ABOVE * height, _LOWEST * height))
     return VanishingPoint(float(np.clip(x, 0.0, width - 1.0)), y, 0.0, weight)
 
 
@@ -59,12 +67,12 @@ def _support(lines: HoughLines, columns: FloatArray, rows: FloatArray, width: in
     """
     at_rows = lines.x_bottom[None, :] + lines.slope[None, :] * (rows[:, None] - bottom)
     scale = _TOLERANCE * width * np.hypot(1.0, lines.slope)
-    distance = (columns[None, :, None] - at_rows[:, None, :]) / scale
-    kernel = lines.votes / (1.0 + distance**2)
-    left = lines.x_bottom[None, None, :] < columns[None, :, None]
-    on_left = (kernel * left).sum(axis=2)
-    on_right = (kernel * ~left).sum(axis=2)
-    support: FloatArray = np.maximum(on_left, on_right) * 0.35 + np.minimum(on_left, on_right) * 1.65
+    distance = columns[None, :, None] / scale - (at_rows / scale)[:, None, :]
+    kernel = 1.0 / (1.0 + distance**2)
+    on_left = lines.votes * (lines.x_bottom < columns[:, None])
+    left = np.einsum("rcl,cl->rc", kernel, on_left)
+    right = kernel @ lines.votes - left
+    support: FloatArray = np.maximum(left, right) * 0.35 + np.minimum(left, right) * 1.65
     return support
 
 
@@ -193,25 +201,38 @@ def find_lines(ridges: Ridges, point: VanishingPoint, width: int) -> FoundLines:
     This is a Hough transform in one dimension: each ridge votes for the lateral position of the line through it. The
     votes of dashes and dots add up over all rows.
     """
-    cells = np.arange(-REACH, REACH + STEP / 2, STEP)
-    votes = _votes(point.positions(ridges.x, ridges.y), ridges.weight, len(cells))
+    # Squared, so that a few bright dots outweigh a wheel track that is slightly lighter over its whole length.
+    return _lines(ridges, ridges.weight**2, point, width, STEP)
+
+
+def find_step_lines(steps: Ridges, point: VanishingPoint, width: int) -> FoundLines:
+    """Returns the strongest lines through `point` along steps of the same sign in an image `width` pixels wide.
+
+    Noise has steps of both signs, whose votes cancel.
+    """
+    return _lines(steps, steps.weight, point, width, COARSE)
+
+
+def _lines(points: Ridges, weights: FloatArray, point: VanishingPoint, width: int, step: float) -> FoundLines:
+    """Returns the strongest lines by the votes of `points` with `weights` (N,), at positions that are `step` apart."""
+    cells = np.arange(-REACH, REACH + step / 2, step)
+    votes = np.abs(_votes(point.positions(points.x, points.y), weights, len(cells), step))
     # Lines that are visible in few rows, near the sides of the image, would win, so the mean includes some empty rows.
-    profile = votes / (_visible_rows(cells, ridges.rows, point, width) + 0.2 * len(ridges.rows))
-    window = 2 * max(1, round(_SEPARATION / STEP / 2)) + 1
+    profile = votes / (_visible_rows(cells, points.rows, point, width) + 0.2 * len(points.rows))
+    window = 2 * max(1, round(_SEPARATION / step / 2)) + 1
     highest = cv2.dilate(profile.reshape(1, -1), np.ones((1, window), np.uint8)).ravel()
     peaks = np.flatnonzero((profile == highest) & (profile > 0.0))
     order = peaks[np.argsort(-profile[peaks], kind="stable")[:_MOST_LINES]]
     return FoundLines(cells[order], profile[order])
 
 
-def _votes(positions: FloatArray, weight: FloatArray, cells: int) -> FloatArray:
+def _votes(positions: FloatArray, weight: FloatArray, cells: int, step: float) -> FloatArray:
     """Returns a smooth histogram (cells,) of the ridges' lateral positions, each counted in its two nearest cells."""
-    position = np.clip((positions + REACH) / STEP, 0.0, cells - 1.001)
+    position = np.clip((positions + REACH) / step, 0.0, cells - 1.001)
     cell = position.astype(int)
-    # Squared, so that a few bright dots outweigh a wheel track that is slightly lighter over its whole length.
-    right = (position - cell) * weight**2
-    counts = np.bincount(cell, weight**2 - right, cells) + np.bincount(cell + 1, right, cells)
-    return np.convolve(counts, np.hanning(2 * round(_VOTE_WIDTH / STEP) + 1), mode="same")
+    right = (position - cell) * weight
+    counts = np.bincount(cell, weight - right, cells) + np.bincount(cell + 1, right, cells)
+    return np.convolve(counts, np.hanning(2 * round(_VOTE_WIDTH / step) + 1), mode="same")
 
 
 def _visible_rows(positions: FloatArray, rows: FloatArray, point: VanishingPoint, width: int) -> FloatArray:

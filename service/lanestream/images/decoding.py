@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import ImageError, ImageTooLargeError
-from lanestream.images.header import Header, corrupt_image, read_body, read_header
+from lanestream.images.header import JPEG_END, JPEG_SCAN, Header, corrupt_image, lacks_end, read_body, read_header
 from lanestream.road.view import Scaling
 
 if TYPE_CHECKING:
@@ -28,6 +28,12 @@ import numpy as np  # noqa: E402
 _FLAGS: Final = {
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
 }  # fmt: skip
+
+# Bytes that a JPEG decoder takes for pixels if pixels are missing, in the current interval and in the following ones.
+# Behind the last pixel they change nothing, except that the decoder complains on standard error.
+_RESTARTS: Final = (b"", *(bytes((0xFF, marker)) for marker in range(0xD0, 0xD8)))
+_OTHER_PIXELS: Final = b"".join(restart + 64 * b"\xb5\x6d\x9a" for restart in _RESTARTS)
+_GRAY_TOLERANCE: Final = 2
 
 
 @dataclass(frozen=True)
@@ -64,8 +70,8 @@ class DecodedImage:
 def decode(data: bytes, limits: ImageLimits) -> Image:
     """Returns the image in `data`, a JPEG, PNG or WebP file, as BGR (H, W, 3) uint8, upright by its EXIF orientation.
 
-    Raises ImageTooLargeError if it exceeds the limits, and ImageError if `data` is not an image, or if the image is too
-    small, too elongated, cut short or corrupt.
+    A JPEG may lack its end marker if it has all its pixels. Raises ImageTooLargeError if it exceeds the limits, and
+    ImageError if `data` is not an image, or if the image is too small, too elongated, cut short or corrupt.
     """
     return _decode_checked(data, _check(data, limits), 1)
 
@@ -98,8 +104,25 @@ def _check(data: bytes, limits: ImageLimits) -> Header:
 
 def _decode_checked(data: bytes, header: Header, reduction: int) -> Image:
     """Returns the pixels of a checked image file, each side divided by `reduction`."""
+    body = read_body(data, header)
+    if not lacks_end(body, header):
+        return _decode_body(body, header, reduction)
+    image = _decode_body(body + JPEG_END, header, reduction)
+    if (body.count(JPEG_SCAN) > 1 or _has_gray_corner(image)) and not np.array_equal(
+        image, _decode_body(body + _OTHER_PIXELS + JPEG_END, header, reduction)
+    ):
+        raise ImageError(f"the {header.kind} image is cut short: its end is missing", "send the whole file")
+    return image
+
+
+def _has_gray_corner(image: Image) -> bool:
+    """Returns whether pixels may be missing at the end of a JPEG: decoders make them gray, wherever EXIF turns them."""
+    return bool((np.abs(image[[0, 0, -1, -1], [0, -1, 0, -1]].astype(int) - 128) <= _GRAY_TOLERANCE).all(axis=1).any())
+
+
+def _decode_body(body: bytes, header: Header, reduction: int) -> Image:
     try:
-        image = cv2.imdecode(np.frombuffer(read_body(data, header), np.uint8), _FLAGS[reduction])
+        image = cv2.imdecode(np.frombuffer(body, np.uint8), _FLAGS[reduction])
     except cv2.error:
         image = None
     # The EXIF orientation may swap the sides. After any other difference the limits were checked on another image.

@@ -22,6 +22,10 @@ _JPEG_FIRST: Final = 0xC0
 _JPEG_SIZE_MARKERS: Final = frozenset(range(_JPEG_FIRST, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_START_OF_SCAN: Final = 0xDA
 _JPEG_END: Final = 0xD9
+JPEG_END: Final = bytes((0xFF, _JPEG_END))
+JPEG_SCAN: Final = bytes((0xFF, _JPEG_START_OF_SCAN))
+_JPEG_MAGIC: Final = b"\xff\xd8\xff"
+_JPEG_LAST_COEFFICIENT: Final = 63
 # TEM, a marker without a length: decoders read on right after it.
 _JPEG_TEMPORARY: Final = 0x01
 # Every scan of a progressive JPEG is a pass over all pixels, and an empty scan takes only a few bytes. Ordinary files
@@ -117,35 +121,58 @@ def _number(data: bytes, start: int, size: int, *, big: bool = False) -> int:
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
     """Reads the size from the first frame segment; decoders refuse a second one."""
-    at = _find_jpeg_marker(data, _JPEG_SIZE_MARKERS, _MAX_JPEG_SCANS)
-    return _number(data, at + 5, 2, big=True), _number(data, at + 3, 2, big=True)
+    for marker, at in _jpeg_markers(data, _MAX_JPEG_SCANS):
+        if marker in _JPEG_SIZE_MARKERS:
+            return _number(data, at + 5, 2, big=True), _number(data, at + 3, 2, big=True)
+    raise IndexError
 
 
 def _jpeg_body(data: bytes) -> bytes:
-    """Returns the file up to its end marker: many cameras pad their files, some append a preview."""
+    """Returns the file up to its end marker: many cameras pad their files, some append a preview.
+
+    If the end marker is missing, but no scan, it returns the whole file: some cameras omit the marker. Only decoding
+    then shows whether pixels are missing, too.
+    """
     width, height = _jpeg_size(data)
     most_scans = min(_MAX_JPEG_SCANS, max(_ORDINARY_JPEG_SCANS, _MAX_JPEG_PASSES // max(1, width * height)))
-    return data[: _find_jpeg_marker(data, frozenset({_JPEG_END}), most_scans)]
+    components, finished = 0, set[int]()
+    for marker, at in _jpeg_markers(data, most_scans):
+        if marker == _JPEG_END:
+            return data[:at]
+        if marker in _JPEG_SIZE_MARKERS:
+            components = _number(data, at + 7, 1)
+        if marker == _JPEG_START_OF_SCAN:
+            end = at + 3 + 2 * _number(data, at + 2, 1)
+            # The last scan of a component has its last coefficient, down to the lowest bit.
+            if _number(data, end + 1, 1) == _JPEG_LAST_COEFFICIENT and _number(data, end + 2, 1) & 0x0F == 0:
+                finished.update(data[at + 3 : end : 2])
+    if not 0 < components <= len(finished):
+        raise IndexError
+    return data.rstrip(b"\xff")
 
 
-def _find_jpeg_marker(data: bytes, wanted: frozenset[int], most_scans: int) -> int:
-    """Returns the offset after the first of the `wanted` markers, reading marker by marker as a decoder does.
+def lacks_end(body: bytes, header: Header) -> bool:
+    """Returns whether the `body` of an image file is that of a JPEG without its end marker."""
+    return header.format.magic == _JPEG_MAGIC and not body.endswith(JPEG_END)
 
-    Raises IndexError if there is none, and ImageError if a decoder would stop before it or would take too long.
+
+def _jpeg_markers(data: bytes, most_scans: int) -> Iterator[tuple[int, int]]:
+    """Yields each marker and the offset after it, as a decoder reads them, to the end marker or the end of the data.
+
+    Raises IndexError if the data end in a segment, and ImageError if a decoder would stop or would take too long.
     """
     at, scans = 2, 0
     for _ in range(_MAX_JPEG_SEGMENTS):
         match = _JPEG_MARKER.search(data, at)
         if match is None:
-            raise IndexError
+            return
         marker, at = match.group(1)[0], match.end()
-        if marker in wanted:
-            return at
-        if marker == _JPEG_END or _JPEG_TEMPORARY < marker < _JPEG_FIRST:
-            raise corrupt_image("JPEG")
         scans += marker == _JPEG_START_OF_SCAN
         if scans > most_scans:
             raise ImageError(f"the JPEG image has more than {most_scans} scans", "save it as a baseline JPEG")
+        yield marker, at
+        if marker == _JPEG_END or _JPEG_TEMPORARY < marker < _JPEG_FIRST:
+            raise corrupt_image("JPEG")
         if marker != _JPEG_TEMPORARY:
             at += _number(data, at, 2, big=True)
     raise ImageError(f"the JPEG image has more than {_MAX_JPEG_SEGMENTS:,} segments", "save it as a baseline JPEG")
@@ -235,7 +262,7 @@ def _webp_body(data: bytes) -> bytes:
 
 
 _FORMATS: Final = (
-    ImageFormat("JPEG", b"\xff\xd8\xff", _jpeg_size, _jpeg_body),
+    ImageFormat("JPEG", _JPEG_MAGIC, _jpeg_size, _jpeg_body),
     ImageFormat("PNG", b"\x89PNG\r\n\x1a\n", _png_size, _png_body),
     ImageFormat("WebP", b"RIFF", _webp_size, _webp_body),
 )

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from lanestream.errors import ModelError
+from lanestream.road.appearance import (
+    BOUNDARY_KINDS,
+    MARKING_COLORS,
+    MARKING_TYPES,
+    BoundaryKind,
+    MarkingColor,
+    MarkingType,
+)
 from lanestream.road.crops import PatchGeometry, RoadCropGeometry
 
 METADATA_KEY: Final = "lanestream"
 # Columns, their deviations, presences and the horizon; see `detection.ego_prior.RegressorOutput`.
 _REGRESSOR_OUTPUTS: Final = 15
+_SIDES: Final = 2
 
 
 class _Description(BaseModel):
@@ -41,12 +50,20 @@ class _Description(BaseModel):
 
 
 class ClassifierInfo(_Description):
-    """A network that recognizes boundaries on patches; its graph already applies the `temperature`."""
+    """A network that recognizes boundaries on patches; its graph already applies the temperatures.
+
+    Its outputs are the probabilities of the `classes`, then those of the `types` and `colors` of a marking. Networks
+    before 0.13 have two classes, without and with a boundary, and no types or colors.
+    """
 
     kind: Literal["classifier"]
-    classes: tuple[str, ...]
+    classes: tuple[str, ...] = Field(min_length=2, max_length=3)
+    types: tuple[MarkingType, ...] = ()
+    colors: tuple[MarkingColor, ...] = ()
     patch: PatchGeometry
     temperature: float = Field(gt=0.0)
+    type_temperature: float = Field(default=1.0, gt=0.0)
+    color_temperature: float = Field(default=1.0, gt=0.0)
 
     @property
     def input_size(self) -> int:
@@ -56,14 +73,32 @@ class ClassifierInfo(_Description):
     @property
     def outputs(self) -> int:
         """The number of outputs for one input."""
-        return len(self.classes)
+        return len(self.classes) + len(self.types) + len(self.colors)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        named = self.classes[1:], self.types, self.colors
+        classifies_markings = named == (BOUNDARY_KINDS, MARKING_TYPES, MARKING_COLORS)
+        if not classifies_markings and (len(self.classes) != 2 or self.types or self.colors):
+            raise ValueError("its classes, types and colors are not those of this version or of an older one")
+        return self
 
 
 class RegressorInfo(_Description):
-    """A network that finds the ego lane's boundaries on a road crop."""
+    """A network that finds the ego lane's boundaries on a road crop.
+
+    `kinds` are the kinds of boundaries that it distinguishes; networks before 0.13 know only markings.
+    """
 
     kind: Literal["regressor"]
+    kinds: tuple[BoundaryKind, ...] = ("marking",)
     road_crop: RoadCropGeometry
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.kinds not in (BOUNDARY_KINDS[:1], BOUNDARY_KINDS):
+            raise ValueError("its kinds are not those of this version or of an older one")
+        return self
 
     @property
     def input_size(self) -> int:
@@ -73,7 +108,7 @@ class RegressorInfo(_Description):
     @property
     def outputs(self) -> int:
         """The number of outputs for one input."""
-        return _REGRESSOR_OUTPUTS
+        return _REGRESSOR_OUTPUTS + _SIDES * (len(self.kinds) - 1)
 
 
 ModelInfo = ClassifierInfo | RegressorInfo

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from lanestream.errors import ProviderError
+from lanestream.errors import ProviderError, needs_whole_packages
 from lanestream.host import instruction_sets
 
 if TYPE_CHECKING:
@@ -50,9 +50,11 @@ class Installed:
 
     @classmethod
     def here(cls) -> Installed:
-        """Returns what is installed on this machine."""
+        """Returns what is installed on this machine. Raises MissingExtraError if onnxruntime is not complete."""
+        with needs_whole_packages():
+            onnxruntime = frozenset(import_module("onnxruntime").get_available_providers())
         return cls(
-            onnxruntime=frozenset(import_module("onnxruntime").get_available_providers()),
+            onnxruntime=onnxruntime,
             openvino=find_spec("openvino") is not None,
             amx="amx_int8" in instruction_sets(),
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -45,7 +45,9 @@ class Lens:
             rays: FloatArray = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
             return rays
         flat = np.ascontiguousarray(pixels, dtype=float).reshape(-1, 1, 2)
-        found = cv2.undistortPointsIter(flat, self._matrix, np.array(self.distortion), np.eye(3), np.eye(3), _UNDISTORT)
+        # In OpenCV 5 `undistortPoints` takes the criteria itself.
+        undistort: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+        found = undistort(flat, self._matrix, np.array(self.distortion), R=np.eye(3), P=np.eye(3), criteria=_UNDISTORT)
         return np.asarray(found, dtype=float).reshape(pixels.shape)
 
     def pixels(self, rays: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from lanestream.road.appearance import Appearance, BoundaryKind
 from lanestream.road.curve import Curve, FloatArray
 from lanestream.road.view import Scaling
 
@@ -29,7 +30,8 @@ class Detection:
 
     `covariance` (3, 3) belongs to the curve's coefficients. The boundary is visible between the rows `top` and
     `bottom`. `probability` is the calibrated probability that it is a lane boundary, `paint` the share of its rows in
-    which a marking is visible, and `expected` whether the ego-lane prior has a boundary there.
+    which a marking is visible, and `expected` whether the ego-lane prior has a boundary there. `appearance` is how it
+    looks in this frame.
     """
 
     curve: Curve
@@ -39,6 +41,7 @@ class Detection:
     probability: float
     paint: float = 1.0
     expected: bool = False
+    appearance: Appearance = Appearance()
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class LaneBoundary:
     `position` is -1 for ego left, +1 for ego right, -2 and +2 for the next ones out. `age_s` counts from its first
     detection. `state` is `detected` if a detection of this frame supports it, `inferred` if one does but little or no
     paint was seen along it, and `predicted` if the filter carries it. `ground` is the boundary in meters if the camera
-    is known, with the covariance `ground_covariance` (3, 3).
+    is known, with the covariance `ground_covariance` (3, 3). `appearance` is what its detections have shown it to be.
     """
 
     track_id: int
@@ -62,6 +65,7 @@ class LaneBoundary:
     age_s: float
     ground: GroundCurve | None = None
     ground_covariance: FloatArray | None = None
+    appearance: Appearance = Appearance()
 
 
 @dataclass(frozen=True)
@@ -164,7 +168,7 @@ class RoadEstimate:
 
 @dataclass(frozen=True)
 class EgoLane:
-    """The lane the camera is in: the track ids of its boundaries and the camera's position between them.
+    """The lane the camera is in: the track ids and the kinds of its boundaries, and the camera's position between them.
 
     `offset` is the camera's distance from the lane's center as a fraction of the lane width at the bottom row, positive
     to the right; `lateral_speed` is its rate in lane widths per second. Both are None unless both boundaries are
@@ -173,6 +177,8 @@ class EgoLane:
 
     left: int | None = None
     right: int | None = None
+    left_kind: BoundaryKind | None = None
+    right_kind: BoundaryKind | None = None
     offset: Estimate | None = None
     lateral_speed: Estimate | None = None
     meters: EgoMeters | None = None

@@ -70,7 +70,10 @@ class Scaling:
 
 @dataclass(frozen=True)
 class RoadView:
-    """The part of an image that can be road: everything below the horizon. Sizes and rows are in its pixels."""
+    """The part of an image that can be road: everything below the horizon. Sizes and rows are in its pixels.
+
+    The horizon of a camera that looks down may be above the image, at a negative row.
+    """
 
     width: int
     height: int
@@ -92,8 +95,15 @@ class RoadView:
         return (self.width - 1) / 2.0
 
     def row_at(self, share: float) -> float:
-        """Returns the row at `share` of the way from the horizon (0) to the bottom (1)."""
+        """Returns the row at `share` of the way from the horizon (0) to the bottom (1).
+
+        If the horizon is above the image, the row may be negative.
+        """
         return self.horizon + share * self.depth
+
+    def highest_row(self, share: float) -> float:
+        """Returns the highest row of the image that is at least `share` of the depth below the horizon."""
+        return max(self.row_at(share), 0.0)
 
     def with_horizon(self, horizon: float) -> RoadView:
         """Returns the same image with another horizon."""
@@ -108,8 +118,8 @@ class Spans:
     bottom: FloatArray
     visible: NDArray[np.bool_]
 
-    def take(self, indices: NDArray[np.intp] | NDArray[np.bool_]) -> Spans:
-        """Returns the spans at `indices`, or those that a mask (N,) selects."""
+    def take(self, indices: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Spans:
+        """Returns the spans at `indices`, or those that a mask (N,) or a slice selects."""
         return Spans(self.top[indices], self.bottom[indices], self.visible[indices])
 
 
@@ -118,7 +128,7 @@ def visible_spans(curves: Curves, view: RoadView, top_share: float = FARTHEST_VI
 
     If a curve leaves the image and comes back, the part nearest to the camera counts.
     """
-    rows = view.bottom + (view.row_at(top_share) - view.bottom) * _TESTED
+    rows = view.bottom + (view.highest_row(top_share) - view.bottom) * _TESTED
     columns = curves.x(rows)
     inside = (columns >= 0.0) & (columns <= view.width - 1.0)
     first = inside.argmax(axis=1)

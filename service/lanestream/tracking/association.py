@@ -12,6 +12,9 @@ from lanestream.road.curve import FloatArray
 # with usual uncertainties this is an innovation of six sigmas. A lost identity is worse than a wrong update, which
 # takes little from an outlier.
 _UNMATCHED: Final = -6.0
+# The kind of a detection may be wrong, however sure the detector is of it. So it decides between two detections, but
+# a track whose only detection is of the other kind still takes it.
+_LEAST_SAME: Final = 0.1
 
 
 def associate(places: FloatArray, costs: FloatArray, apart: FloatArray, farthest: float) -> list[tuple[int, int]]:
@@ -32,6 +35,15 @@ def associate(places: FloatArray, costs: FloatArray, apart: FloatArray, farthest
     seen_left_to_right = np.argsort(places[0] + apart[0], kind="stable").tolist()
     aligned = _best_alignment(gains[np.ix_(left_to_right, seen_left_to_right)].tolist())
     return [(left_to_right[i], seen_left_to_right[j]) for i, j in aligned]
+
+
+def kind_costs(tracks: FloatArray, detections: FloatArray) -> FloatArray:
+    """Returns the costs (N, M) of pairs that may be of different kinds, to be added to those of `associate`.
+
+    `tracks` (N,) and `detections` (M,) are probabilities of road edges. The costs are negative log likelihoods, too.
+    """
+    same = tracks[:, None] * detections + (1.0 - tracks[:, None]) * (1.0 - detections)
+    return np.asarray(-np.log(np.maximum(same, _LEAST_SAME)))
 
 
 def _best_alignment(gains: list[list[float]]) -> list[tuple[int, int]]:

@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lanestream.errors import one_line
+from lanestream.road.appearance import MARKING_COLORS, MARKING_TYPES, Appearance
 from lanestream.road.results import TrackState
 from lanestream.road.view import LANE_WIDTHS, USUAL_LANE_WIDTH
 from lanestream.tracking.frame_clock import FrameClock
@@ -20,7 +22,8 @@ from lanestream.tracking.tracks import ACTIVITIES, FRAMES, SCALES, Track
 
 # The road filter: its mean, and the lower triangle of its covariance.
 _NUMBER: Final = np.dtype("<f4")
-# A track; id 0 is that of a tentative one, and bit n of `hits` the frame n frames ago.
+# A track; id 0 is that of a tentative one, and bit n of `hits` the frame n frames ago. Types and colors that are not
+# known are zero.
 _TRACK: Final = np.dtype(
     [
         ("track_id", "<u8"),
@@ -38,6 +41,9 @@ _TRACK: Final = np.dtype(
         ("hits", "u1"),
         ("frames", "u1"),
         ("surprising", "<u4"),
+        ("road_edge", "<f4"),
+        ("types", "<f2", len(MARKING_TYPES)),
+        ("colors", "<f2", len(MARKING_COLORS)),
     ]
 )
 _STATES: Final[tuple[TrackState, ...]] = get_args(TrackState)
@@ -53,6 +59,8 @@ _MOST_TRACKS: Final = 32
 _MOST_DIGITS: Final = 24
 # By rounding to single precision, an eigenvalue of a covariance scaled to correlations may be negative by this.
 _ROUNDING: Final = 1e-4
+# By rounding to half precision, the sum of probabilities may miss 1 by this.
+_SUM_ROUNDING: Final = 2e-3
 
 
 @dataclass(frozen=True)
@@ -157,6 +165,9 @@ class TrackerState:
         check_range("scale", track.scale, *SCALES)
         check_range("paint", track.paint, 0.0, 1.0)
         check_range("number of hits", len(track.hits), 1, FRAMES)
+        check_range("road_edge", track.appearance.road_edge, 0.0, 1.0)
+        _check_distribution("types", track.appearance.types)
+        _check_distribution("colors", track.appearance.colors)
         if track.side not in (-1, 1):
             raise ValueError("the side of a track is neither -1 nor 1")
 
@@ -165,6 +176,15 @@ def check_range(name: str, value: float | None, least: float, most: float) -> No
     """Raises ValueError if `value` is outside a range, or NaN. None is accepted."""
     if value is not None and not least <= value <= most:
         raise ValueError(f"{name} is {one_line(value, _MOST_DIGITS)}; expected {least:g} to {most:g}")
+
+
+def _check_distribution(name: str, probabilities: tuple[float, ...] | None) -> None:
+    """Raises ValueError unless the numbers are probabilities with the sum 1. None is accepted."""
+    if probabilities is None:
+        return
+    for probability in probabilities:
+        check_range(name, probability, 0.0, 1.0)
+    check_range(f"sum of {name}", sum(probabilities), 1.0 - _SUM_ROUNDING, 1.0 + _SUM_ROUNDING)
 
 
 def _pack_tracks(tracks: Sequence[Track]) -> str:
@@ -186,6 +206,9 @@ def _pack_tracks(tracks: Sequence[Track]) -> str:
                 sum(hit << age for age, hit in enumerate(reversed(track.hits))),
                 len(track.hits),
                 track.surprising,
+                track.appearance.road_edge,
+                track.appearance.types or (0.0,) * len(MARKING_TYPES),
+                track.appearance.colors or (0.0,) * len(MARKING_COLORS),
             )
             for track in tracks
         ],
@@ -200,8 +223,14 @@ def _unpack_track(record: np.void) -> Track:
     if state >= len(_STATES):
         raise ValueError(f"the state of a track is {state}; expected 0 to {len(_STATES) - 1}")
     values["track_id"] = values["track_id"] or None
+    road_edge, types, colors = (values.pop(name) for name in ("road_edge", "types", "colors"))
+    appearance = Appearance(road_edge, _known(types), _known(colors))
     recent = (bool(hits >> age & 1) for age in reversed(range(frames)))
-    return Track(**values, state=_STATES[state], hits=deque(recent, maxlen=FRAMES))
+    return Track(**values, state=_STATES[state], appearance=appearance, hits=deque(recent, maxlen=FRAMES))
+
+
+def _known(probabilities: NDArray[np.float16]) -> tuple[float, ...] | None:
+    return tuple(probabilities.tolist()) if probabilities.any() else None
 
 
 def _pack_filter(road: RoadFilter) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from lanestream.road.appearance import BOUNDARY_KINDS, BoundaryKind
 from lanestream.road.curve import Curves, FloatArray
 from lanestream.road.results import (
     Detection,
@@ -21,7 +22,7 @@ from lanestream.road.results import (
     Side,
 )
 from lanestream.road.view import USUAL_LANE_WIDTH, RoadView, visible_spans
-from lanestream.tracking.association import associate
+from lanestream.tracking.association import associate, kind_costs
 from lanestream.tracking.ego_lane import has_changed_sides, lane_positions, learned_width
 from lanestream.tracking.frame_clock import FrameClock
 from lanestream.tracking.kalman import costs
@@ -46,11 +47,13 @@ class LaneTracker:
     """Tracks the boundaries of one camera with one road filter.
 
     A boundary is reported from its third detection on. In the first frames of a stream, those that the ego-lane prior
-    expects are reported at once, and in a `single_image` all: no other frame will follow.
+    expects are reported at once, and in a `single_image` all: no other frame will follow. Boundaries that are not of
+    the `kinds` are followed and not reported.
     """
 
-    def __init__(self, single_image: bool = False) -> None:
+    def __init__(self, single_image: bool = False, kinds: Collection[BoundaryKind] = BOUNDARY_KINDS) -> None:
         self._single_image = single_image
+        self._kinds = kinds
         self._tracks: list[Track] = []
         self._road: RoadFilter | None = None
         self._mean_horizon = 0.0
@@ -62,14 +65,20 @@ class LaneTracker:
         self._nis: FloatArray = np.zeros(0)
 
     @classmethod
-    def restored(cls, state: TrackerState, ids_lost: int = 0, single_image: bool = False) -> LaneTracker:
+    def restored(
+        cls,
+        state: TrackerState,
+        ids_lost: int = 0,
+        single_image: bool = False,
+        kinds: Collection[BoundaryKind] = BOUNDARY_KINDS,
+    ) -> LaneTracker:
         """Returns a tracker that continues where `state` was taken.
 
         `ids_lost` more ids count as assigned, because a tracker that continued after `state` was taken and is now lost
         may have assigned them.
         Raises ValueError for an invalid state.
         """
-        tracker = cls(single_image)
+        tracker = cls(single_image, kinds)
         tracker._tracks, tracker._road = state.unpacked()
         tracker._mean_horizon = state.mean_horizon
         tracker._lane_width = state.lane_width
@@ -128,7 +137,8 @@ class LaneTracker:
         road = self._predicted_road(view, self._clock.now - earlier)
         values, noise = road.measure(detections)
         apart = self._apart(road, values)
-        pairs = self._associate(road, values, noise, apart)
+        road_edges = np.array([detection.appearance.road_edge for detection in detections])
+        pairs = self._associate(road, values, noise, apart, road_edges)
         if is_cut or (not pairs and self._is_elsewhere(apart)):
             events.append(SceneCut(timestamp))
             self._tracks, self._frames, self._activity, pairs = [], 0, 1.0, []
@@ -146,7 +156,9 @@ class LaneTracker:
         events += self._lane_changes(earlier, middle)
         for track in self._tracks:
             track.round()
-        return replace(self._result(detections, view, middle), events=tuple(events), warnings=warnings)
+        result = self._result(detections, view, middle)
+        self._learn_lane_width(middle)
+        return replace(result, events=tuple(events), warnings=warnings)
 
     def _predicted_road(self, view: RoadView, seconds: float) -> RoadFilter:
         """Returns the road at this frame's time, and drops the tracks that are too old after a gap in the stream."""
@@ -173,13 +185,15 @@ class LaneTracker:
         return np.asarray((values[:, 1] - expected) / (ROWS[1] * self._lane_width))
 
     def _associate(
-        self, road: RoadFilter, values: FloatArray, noise: FloatArray, apart: FloatArray
+        self, road: RoadFilter, values: FloatArray, noise: FloatArray, apart: FloatArray, road_edges: FloatArray
     ) -> list[tuple[int, int]]:
+        """Returns (track, detection) pairs; `road_edges` (M,) are the detections' probabilities of that kind."""
         if not apart.size:
             return []
         expected, covariances = road.expected()
         places = expected[:, 1] / (ROWS[1] * self._lane_width)
-        return associate(places, costs(expected, covariances, values, noise), apart, _FARTHEST)
+        kinds = kind_costs(np.array([track.appearance.road_edge for track in self._tracks]), road_edges)
+        return associate(places, costs(expected, covariances, values, noise) + kinds, apart, _FARTHEST)
 
     def _is_elsewhere(self, apart: FloatArray) -> bool:
         """Returns whether nothing is near several boundaries that were found a frame ago."""
@@ -268,7 +282,7 @@ class LaneTracker:
         return not track.confirmed or self._road.place_sigmas[index] <= SAME * self._lane_width
 
     def _merge_and_confirm(self) -> None:
-        """Merges the tracks that follow one marking, and confirms those with enough hits."""
+        """Merges the tracks that follow one boundary, and confirms those with enough hits."""
         if self._road is None:
             return
         curves = self._road.curves()
@@ -286,22 +300,40 @@ class LaneTracker:
         sideways, now = self._road.sideways.value, self._clock.now
         changes = []
         for track, place in zip(self._tracks, (self._places - middle).tolist(), strict=True):
-            if has_changed_sides(track, place, sideways, self._lane_width, earlier, now) and track.track_id is not None:
+            changed = has_changed_sides(track, place, sideways, self._lane_width, earlier, now)
+            if changed and track.track_id is not None and track.appearance.kind in self._kinds:
                 # A boundary that is now on the left shows that the vehicle moved to the right.
                 side: Side = "right" if track.side < 0 else "left"
                 changes.append(LaneChange(track.track_id, side, self._clock.timestamp_at(track.crossed)))
         return changes
 
+    def _known(self, road: RoadFilter) -> list[int]:
+        """Returns the indices of the boundaries that are certain enough to be reported, from left to right."""
+        left_to_right: list[int] = np.argsort(road.places, kind="stable").tolist()
+        if self._single_image:
+            return left_to_right
+        sigmas = road.place_sigmas
+        return [i for i in left_to_right if self._tracks[i].confirmed and sigmas[i] <= _MOST_SIGMA * self._lane_width]
+
+    def _learn_lane_width(self, middle: float) -> None:
+        """Learns the lane width from the nearest boundaries, of any kind: what is reported does not change tracking."""
+        road = self._road
+        if road is None:
+            return
+        known = self._known(road)
+        tracks = [self._tracks[i] for i in known]
+        at = dict(
+            zip(lane_positions(tracks, (road.places[known] - middle).tolist(), self._lane_width), known, strict=True)
+        )
+        left, right = at.get(-1), at.get(1)
+        if left is not None and right is not None and self._tracks[left].hits[-1] and self._tracks[right].hits[-1]:
+            self._lane_width = learned_width(self._lane_width, float(road.places[right] - road.places[left]))
+
     def _result(self, detections: Sequence[Detection], view: RoadView, middle: float) -> FrameResult:
         road = self._road
         if road is None or not self._tracks:
             return FrameResult((), EgoLane(), view.horizon)
-        sigmas = road.place_sigmas
-        reported = [
-            i
-            for i in np.argsort(self._places, kind="stable").tolist()
-            if self._single_image or (self._tracks[i].confirmed and sigmas[i] <= _MOST_SIGMA * self._lane_width)
-        ]
+        reported = [i for i in self._known(road) if self._tracks[i].appearance.kind in self._kinds]
         if not reported:
             return FrameResult((), EgoLane(), road.pitched_horizon)
         if self._single_image:
@@ -327,6 +359,7 @@ class LaneTracker:
                 top=max(float(spans.top[i]), track.top),
                 bottom=float(spans.bottom[i]),
                 age_s=self._clock.now - track.born,
+                appearance=track.appearance_at(self._clock.now),
             )
             for i, track in enumerate(tracks)
             if spans.visible[i]
@@ -335,14 +368,14 @@ class LaneTracker:
         return FrameResult(lanes, self._ego_lane(road, at.get(-1), at.get(1), view), horizon, road=road.estimate)
 
     def _ego_lane(self, road: RoadFilter, left: int | None, right: int | None, view: RoadView) -> EgoLane:
-        """Returns the ego lane between the tracks at the indices `left` and `right`, and learns the lane width."""
-        ids = [None if i is None else self._tracks[i].track_id for i in (left, right)]
-        ego = EgoLane(left=ids[0], right=ids[1])
+        """Returns the ego lane between the tracks at the indices `left` and `right`."""
+        bounds = [None if i is None else self._tracks[i] for i in (left, right)]
+        ids = [None if track is None else track.track_id for track in bounds]
+        kinds = [None if track is None else track.appearance.kind for track in bounds]
+        ego = EgoLane(left=ids[0], right=ids[1], left_kind=kinds[0], right_kind=kinds[1])
         if left is None or right is None:
             return ego
         width = float(road.places[right] - road.places[left])
-        if self._tracks[left].hits[-1] and self._tracks[right].hits[-1]:
-            self._lane_width = learned_width(self._lane_width, width)
         if width <= 0.0:
             return ego
         center, sideways = road.lane_center(left, right), road.sideways

@@ -10,7 +10,9 @@ from typing import Final
 
 import numpy as np
 
+from lanestream.road.appearance import Appearance
 from lanestream.road.results import Detection, TrackState
+from lanestream.tracking.appearance import accumulated, as_saved, forgotten
 
 # The values of a track that are saved in single precision.
 SINGLE_PRECISION: Final = ("probability", "top", "bottom", "place", "scale", "paint")
@@ -62,7 +64,7 @@ class Track:
     `place` is where it was in the last frame, in row offsets from the vehicle's middle, and `crossed` the time at which
     that last changed its sign. `scale` multiplies the noise of its detections: they are more exact on clear paint.
     `paint` is the usual share of its rows in which a marking is visible, and `surprising` counts the detections in a
-    row that were far from where it was expected.
+    row that were far from where it was expected. `appearance` is what its detections have shown it to be by `last_hit`.
     """
 
     born: float
@@ -78,14 +80,24 @@ class Track:
     scale: float = 1.0
     paint: float = 0.0
     surprising: int = 0
+    appearance: Appearance = Appearance()
     hits: deque[bool] = field(default_factory=lambda: deque(maxlen=FRAMES))
 
     @classmethod
     def begun(cls, detection: Detection, place: float, now: float) -> Track:
         """Returns the track of a new boundary, which `detection` is about to support."""
         side = 1 if place >= 0.0 else -1
-        paint = min(detection.paint, _MOST_PAINT)
-        return cls(now, now, detection.probability, detection.top, detection.bottom, side, place, paint=paint)
+        return cls(
+            now,
+            now,
+            detection.probability,
+            detection.top,
+            detection.bottom,
+            side,
+            place,
+            paint=min(detection.paint, _MOST_PAINT),
+            appearance=accumulated(Appearance(), detection.appearance, math.inf, _paint_share(detection)),
+        )
 
     @property
     def confirmed(self) -> bool:
@@ -131,6 +143,9 @@ class Track:
         else:
             self.state = "detected"
             self.paint += _PAINT_GAIN * (min(detection.paint, _MOST_PAINT) - self.paint)
+        self.appearance = accumulated(
+            self.appearance, detection.appearance, now - self.last_hit, _paint_share(detection)
+        )
         self.last_hit = now
         self.probability += _PROBABILITY_GAIN * (detection.probability - self.probability)
         self.top += _ROWS_GAIN * (detection.top - self.top)
@@ -145,12 +160,15 @@ class Track:
         self.state = "predicted"
 
     def round(self) -> None:
-        """Rounds what is saved in single precision, so that a restored track continues exactly."""
+        """Rounds what is saved in single or half precision, so that a restored track continues exactly."""
         for name in SINGLE_PRECISION:
             setattr(self, name, float(np.float32(getattr(self, name))))
+        self.appearance = as_saved(self.appearance)
 
     def take_over(self, other: Track) -> None:
-        """Continues with the place and the support of `other`, which follows the same marking."""
+        """Continues with the place and the support of `other`, which follows the same boundary."""
+        # What the detections of the other track have shown counts as one more detection.
+        self.appearance = accumulated(self.appearance, other.appearance, max(0.0, other.last_hit - self.last_hit), 1.0)
         self.last_hit, self.state, self.hits, self.scale = other.last_hit, other.state, other.hits, other.scale
         self.top, self.bottom, self.probability = other.top, other.bottom, other.probability
 
@@ -158,7 +176,16 @@ class Track:
         """Returns the factor of its probability, which falls with the time since its last detection."""
         return 1.0 - 0.5 * min(1.0, (now - self.last_hit) / _COAST_S[1])
 
+    def appearance_at(self, now: float) -> Appearance:
+        """Returns what is known at the time `now` of what it is."""
+        return forgotten(self.appearance, now - self.last_hit)
+
     def is_alive(self, now: float, step: float) -> bool:
         """Whether it can still be confirmed, or coasts."""
         is_tentative = not self.confirmed and len(self.hits) - sum(self.hits) <= FRAMES - HITS
         return (self.confirmed or is_tentative) and now - self.last_hit <= self.coasting_s(step)
+
+
+def _paint_share(detection: Detection) -> float:
+    """Returns how much of a marking a detection shows: 1 from the usual paint of a dashed marking on."""
+    return min(detection.paint / _MOST_PAINT, 1.0)

@@ -7,9 +7,20 @@ import numpy as np
 import pytest
 
 from lanestream.errors import SourceError
-from lanestream.protocol import DepartureModel, EgoModel, LaneModel, LanesMessage, LineModel, error_message
+from lanestream.protocol import (
+    DepartureModel,
+    EgoModel,
+    LaneModel,
+    LanesMessage,
+    LineModel,
+    MarkingColor,
+    MarkingModel,
+    MarkingType,
+    error_message,
+)
 from lanestream.road.view import Image
-from lanestream_client.drawing import ALERT, CAUTION
+from lanestream_client.drawing import ALERT, CAUTION, WHITE, position_color
+from lanestream_client.line_styles import line_name
 from lanestream_client.overlays import draw_error, draw_lanes
 
 
@@ -66,6 +77,97 @@ def test_boundaries_without_a_detection_are_dashed() -> None:
     predicted, inferred, detected = (drawn_pixels(state) for state in ("predicted", "inferred", "detected"))
     assert predicted < 0.75 * detected
     assert 1.1 * predicted < inferred < 0.95 * detected
+
+
+def painted(color: MarkingColor, kind: MarkingType) -> dict[str, object]:
+    """Returns the fields of a lane that is a marking of this type and color."""
+    return {
+        "kind": "marking",
+        "marking": MarkingModel(type=kind, type_probability=0.9, color=color, color_probability=0.9, probability=0.8),
+    }
+
+
+def alone(image: Image, message: LanesMessage, **fields: object) -> Image:
+    """Returns the road below the legend with only the right boundary, with these fields, on it."""
+    lane = message.lanes[1].model_copy(update=fields)
+    return draw_lanes(image, message.model_copy(update={"lanes": [lane]}))[360:]
+
+
+def pieces(drawn: Image, lane: LaneModel, aside: float = 0.0) -> int:
+    """Returns the number of pieces in which a boundary is drawn, along its curve or some pixels aside."""
+    rows = np.arange(362, 718)
+    columns = np.round([lane.x(float(row)) + aside for row in rows]).astype(int)
+    on = (drawn[rows - 360, columns] != 90).any(axis=1)
+    return int(on[0]) + int((np.diff(on.astype(int)) == 1).sum())
+
+
+def test_the_shape_of_a_marking_is_its_type() -> None:
+    image, message = road(1280, 720)
+    lane = message.lanes[1]
+    solid, dashed, dots, double = (
+        alone(image, message, **painted("white", kind)) for kind in ("solid", "dashed", "dots", "double")
+    )
+    assert [pieces(drawn, lane) for drawn in (solid, dashed)] == [1, 7]
+    assert pieces(dots, lane) > 14
+    # The label hides the middle of the lower part, so the two lines are counted above it.
+    across = slice(int(lane.x(430.0)) - 15, int(lane.x(430.0)) + 16)
+    colored = [np.ptp(drawn[70, across].astype(int), axis=1) > 60 for drawn in (solid, double)]
+    assert [int((np.diff(np.pad(on, 1).astype(int)) == 1).sum()) for on in colored] == [1, 2]
+
+
+def test_a_yellow_marking_has_a_yellow_core() -> None:
+    image, message = road(1280, 720)
+    yellow = (0, 235, 255)
+    drawn = {color: alone(image, message, **painted(color, "solid")) for color in ("white", "yellow")}
+    assert with_color(drawn["yellow"], yellow) > 500
+    assert with_color(drawn["white"], yellow) == 0
+    blue = position_color(1)
+    assert with_color(drawn["yellow"], blue) > 500, "its rims show the position"
+
+
+@pytest.mark.parametrize(("position", "side"), [(-2, -1), (-1, -1), (1, 1), (2, 1)])
+def test_a_road_edge_is_white_with_ticks_away_from_the_vehicle(position: int, side: int) -> None:
+    image, message = road(1280, 720)
+    lane = message.lanes[1]
+    edge = alone(image, message, kind="road_edge", position=position)
+    assert with_color(edge, WHITE) > 500
+    rows = np.array([row for row in range(362, 718) if not 530 <= row < 660])  # the label is between
+    columns = np.round([lane.x(float(row)) for row in rows]).astype(int)
+    ticks = [with_color(edge[rows - 360, columns + sign * 20][None], WHITE) for sign in (side, -side)]
+    assert ticks[0] > 5
+    assert ticks[1] == 0
+
+
+@pytest.mark.parametrize("fields", [{"kind": "road_edge"}, painted("white", "dashed"), painted("yellow", "double")])
+def test_a_predicted_boundary_is_paler_whatever_it_is(fields: dict[str, object]) -> None:
+    image, message = road(1280, 720)
+    brightest = [
+        int(alone(image, message, state=state, **fields)[:150].max()) for state in ("predicted", "inferred", "detected")
+    ]
+    assert brightest[0] + 30 < brightest[1] + 15 < brightest[2]
+
+
+def test_the_legend_says_what_boundaries_are() -> None:
+    _, message = road(320, 180)
+    marking, edge = message.lanes
+    assert line_name(marking) == ""
+    assert line_name(marking.model_copy(update=painted("yellow", "double"))) == "double yellow"
+    assert line_name(edge.model_copy(update={"kind": "road_edge"})) == "road edge"
+
+
+@pytest.mark.parametrize("kind", ["solid", "dashed", "double", "dots"])
+def test_the_map_shows_what_boundaries_are(kind: MarkingType) -> None:
+    image, message = road(1280, 720)
+    known = in_meters(message, 0.0, DepartureModel(), 1e-6)
+
+    def map_of(**fields: object) -> Image:
+        lanes = [lane.model_copy(update=fields) for lane in known.lanes]
+        return draw_lanes(image, known.model_copy(update={"lanes": lanes}))[13:242, 1118:1267]
+
+    white, yellow, edge = map_of(**painted("white", kind)), map_of(**painted("yellow", kind)), map_of(kind="road_edge")
+    assert (white != yellow).any()
+    assert (white != edge).any()
+    assert (white != map_of()).any() == (kind != "solid")
 
 
 def in_meters(message: LanesMessage, offset_m: float, departure: DepartureModel, variance: float) -> LanesMessage:

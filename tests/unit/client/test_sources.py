@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
 
 import av
+import cv2
 import fakes
 import numpy as np
 import pytest
+from PIL import Image
 
 from lanestream.errors import ImageError, SourceError
 from lanestream.images.header import read_header
@@ -93,34 +95,6 @@ def test_a_truncated_video_is_read_up_to_its_end(tmp_path: Path) -> None:
         assert 0 < len(list(source.frames)) < 40
 
 
-def test_a_network_stream_that_fails_says_after_how_many_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_video(tmp_path / "a.mp4", [0.0, 0.04, 0.08])
-
-    class FailingContainer:
-        def __init__(self, container: av.container.InputContainer) -> None:
-            self.streams, self.duration, self._container = container.streams, None, container
-
-        def __enter__(self) -> Self:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            self._container.close()
-
-        def decode(self, video: int) -> Iterator[av.VideoFrame]:
-            yield from self._container.decode(video=video)
-            raise av.error.InvalidDataError(1, "broken data")
-
-    open_container = av.open
-    monkeypatch.setattr(av, "open", lambda _, **__: FailingContainer(open_container(path)))
-    with open_source("rtsp://user:password@camera/1") as source:
-        assert source.live
-        assert [next(source.frames).seq for _ in range(3)] == [0, 1, 2]
-        with pytest.raises(SourceError, match=r"^rtsp://camera/1 failed after 3 frames: broken data"):
-            next(source.frames)
-
-
 def test_a_frame_that_is_not_an_image_has_no_pixels() -> None:
     with pytest.raises(ImageError, match=r"a\.jpg can't be decoded"):
         SourceFrame(0, None, data=b"x", name="a.jpg").image()
@@ -153,3 +127,149 @@ def test_a_live_source_yields_its_newest_frame() -> None:
 def test_iteration_ends_with_a_live_source() -> None:
     with NewestFrames(iter([SourceFrame(0, 0.0)])) as newest:
         assert [frame.seq for frame in newest] == [0]
+
+
+def damage(path: Path, size: int) -> str:
+    """Overwrites the middle of a file with zeros."""
+    data = bytearray(path.read_bytes())
+    start = len(data) // 2
+    data[start : start + size] = bytes(size)
+    path.write_bytes(data)
+    return str(path)
+
+
+def noise_video(path: Path, codec: str, count: int = 50) -> Path:
+    """Writes a video whose frames have many bytes and depend on each other."""
+    scene = np.random.default_rng(3).integers(0, 255, (120, 160, 3), np.uint8)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.codec_context.gop_size = 10
+        for number in range(count):
+            frame = av.VideoFrame.from_ndarray(np.roll(scene, 5 * number, 1), "bgr24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"), [("a.mp4", "libx264"), ("a.mp4", "mpeg4"), ("a.mov", "mjpeg"), ("a.avi", "mjpeg")]
+)
+def test_damaged_bytes_cost_their_frames_and_are_counted(tmp_path: Path, name: str, codec: str) -> None:
+    path = noise_video(tmp_path / name, codec)
+    with open_source(damage(path, path.stat().st_size // 10)) as source:
+        frames = list(source.frames)
+    assert 0 < source.counts.lost_frames <= 20
+    assert len(frames) + source.counts.lost_frames == 50
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mjpeg"])
+def test_an_intact_video_loses_nothing(tmp_path: Path, codec: str) -> None:
+    with open_source(str(noise_video(tmp_path / "a.avi", codec))) as source:
+        assert len(list(source.frames)) == 50
+    assert source.counts.lost_frames == 0
+
+
+def test_frames_say_which_clock_their_time_is_from(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(fakes.image_file(".png"))
+    raw = noise_video(tmp_path / "a.mjpeg", "mjpeg", 5)
+    for path, clock in (
+        (write_video(tmp_path / "a.mp4", [0.0, 0.04]), "source"),
+        (raw, "frame_rate"),
+        (tmp_path / "a.png", "frame_rate"),
+    ):
+        with open_source(str(path)) as source:
+            assert {frame.clock for frame in source.frames} == {clock}
+
+
+# Of the 3 x 3 matrix in a file, the first four numbers by their usual names, and what OpenCV does to show the image so.
+ORIENTATIONS = {
+    (1, 0, 0, 1): lambda image: image,
+    (-1, 0, 0, 1): lambda image: cv2.flip(image, 1),
+    (1, 0, 0, -1): lambda image: cv2.flip(image, 0),
+    (-1, 0, 0, -1): lambda image: cv2.rotate(image, cv2.ROTATE_180),
+    (0, 1, -1, 0): lambda image: cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE),
+    (0, -1, 1, 0): lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
+    (0, 1, 1, 0): cv2.transpose,
+    (0, -1, -1, 0): lambda image: cv2.flip(cv2.transpose(image), -1),
+}
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_a_video_is_shown_as_its_orientation_says(tmp_path: Path, orientation: tuple[int, int, int, int]) -> None:
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:24, :16] = 255  # no two orientations look the same
+    with video_sink(tmp_path / "a.mp4", 25.0) as sink:
+        assert sink is not None
+        sink.write(image, 0.0)
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    matrix = data.index(b"tkhd") + 4 + 40
+    assert data[matrix : matrix + 4] == struct.pack(">i", 1 << 16)
+    a, b, c, d = (value << 16 for value in orientation)
+    data[matrix : matrix + 20] = struct.pack(">5i", a, b, 0, c, d)
+    (tmp_path / "a.mp4").write_bytes(data)
+    with open_source(str(tmp_path / "a.mp4")) as source:
+        (frame,) = source.frames
+    assert frame.pixels is not None
+    expected = ORIENTATIONS[orientation](image)
+    assert frame.pixels.shape == expected.shape
+    assert np.abs(frame.pixels.astype(int) - expected).mean() < 8
+
+
+def test_a_turned_picture_in_a_video_of_jpegs_is_upright(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x112] = 6  # to be turned by 90 degrees
+    Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    (tmp_path / "a.jpg").rename(tmp_path / "a.mjpeg")
+    with open_source(str(tmp_path / "a.mjpeg")) as source:
+        assert next(source.frames).image().shape == (64, 48, 3)
+
+
+def test_a_file_without_an_index_is_explained(tmp_path: Path) -> None:
+    complete = Path(write_video(tmp_path / "a.mp4", [0.04 * number for number in range(20)], (320, 180))).read_bytes()
+    with av.open(str(tmp_path / "late.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        assert isinstance(stream, av.VideoStream)
+        for _ in range(20):
+            container.mux(stream.encode(av.VideoFrame(640, 480, "yuv420p")))
+        container.mux(stream.encode(None))
+    index_at_the_end = (tmp_path / "late.mp4").read_bytes()
+    start = complete.index(b"moov") - 4
+    files = {
+        "no-index.mp4": (index_at_the_end[: len(index_at_the_end) // 2], r"has no index \(`moov`\)"),
+        "cut-index.mp4": (complete[: start + 100], r"index \(`moov`\) is cut off"),
+        "cut-index-late.mp4": (
+            index_at_the_end[: index_at_the_end.index(b"moov") + 100],
+            r"index \(`moov`\) is cut off",
+        ),
+        "fragment.mp4": (
+            struct.pack(">I4s", 16, b"styp") + bytes(8) + struct.pack(">I4s", 16, b"moof") + bytes(8),
+            "fragment",
+        ),
+        "empty.mp4": (b"", "the file is empty"),
+        "zeros.mp4": (bytes(5000), "begins with zeros"),
+    }
+    for name, (data, message) in files.items():
+        (tmp_path / name).write_bytes(data)
+        with (
+            pytest.raises(SourceError, match=rf"can't open .*{name}: .*{message}") as caught,
+            open_source(str(tmp_path / name)),
+        ):
+            pass
+        assert "\n" not in str(caught.value)
+
+
+def test_a_waiting_reader_of_a_live_source_can_be_stopped() -> None:
+    silence = threading.Event()
+
+    def camera() -> Iterator[SourceFrame]:
+        silence.wait(fakes.WAIT_S)
+        yield SourceFrame(0, 0.0)
+
+    with NewestFrames(camera()) as newest:
+        timer = threading.Timer(0.1, newest.stop)
+        timer.start()
+        assert list(newest) == []
+        silence.set()
+        timer.join()

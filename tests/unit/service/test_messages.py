@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from lanestream.images.decoding import DecodedImage
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.protocol import LanesMessage, parse_server_message
+from lanestream.road.appearance import Appearance
 from lanestream.road.curve import Curve, curve_basis
 from lanestream.road.results import (
     Calibration,
@@ -59,6 +60,35 @@ def test_all_fields_are_reported() -> None:
     assert reported.points[-1] == reported.line.top
     assert [y for _, y in reported.points] == sorted((y for _, y in reported.points), reverse=True)
     assert (reported.ground, reported.ground_covariance) == (None, None)
+    assert (reported.kind, reported.kind_probability, reported.marking) == ("marking", 1.0, None)
+
+
+def test_what_a_boundary_is_is_reported() -> None:
+    lane = boundary(Curve(870.0, (1919.5, -1.25, 5000.0)), 1000.0, 2159.0)
+    appearances = (
+        Appearance(0.01234, (0.03, 0.94, 0.02, 0.01), (0.2, 0.8)),
+        Appearance(0.87654, (0.25,) * 4, (0.5, 0.5)),
+        Appearance(0.4, None, None),
+    )
+    lanes = tuple(replace(lane, appearance=appearance) for appearance in appearances)
+    message = as_message(FrameResult(lanes, EgoLane(5, 6, left_kind="marking", right_kind="road_edge"), 870.0))
+    marking, edge, unclassified = (
+        one.model_dump(include={"kind", "kind_probability", "marking"}) for one in message.lanes
+    )
+    assert marking == {
+        "kind": "marking",
+        "kind_probability": 0.9877,
+        "marking": {
+            "type": "dashed",
+            "type_probability": 0.94,
+            "color": "yellow",
+            "color_probability": 0.8,
+            "probability": 0.752,
+        },
+    }
+    assert edge == {"kind": "road_edge", "kind_probability": 0.8765, "marking": None}
+    assert unclassified == {"kind": "marking", "kind_probability": 0.6, "marking": None}
+    assert (message.ego.left_kind, message.ego.right_kind) == ("marking", "road_edge")
 
 
 def test_meters_are_reported_with_their_sigmas() -> None:
@@ -88,6 +118,8 @@ def test_meters_are_reported_with_their_sigmas() -> None:
     assert message.ego.model_dump() == {
         "left": 5,
         "right": 6,
+        "left_kind": None,
+        "right_kind": None,
         "offset": 0.0346,
         "offset_sigma": 0.01,
         "offset_m": 0.123,

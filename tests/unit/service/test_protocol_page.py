@@ -16,11 +16,15 @@ from lanestream.protocol import (
     MAX_SEQ,
     SUBPROTOCOL,
     WARNINGS,
+    BoundaryKind,
     DepartureOptions,
     EgoModel,
     EventModel,
     LaneModel,
     Limits,
+    MarkingColor,
+    MarkingModel,
+    MarkingType,
     parse_client_message,
     parse_server_message,
 )
@@ -71,7 +75,11 @@ def rows(header: str) -> dict[str, list[str]]:
 def test_the_tables_of_results_are_complete() -> None:
     assert set(rows("| state | |")) == set(get_args(LaneModel.model_fields["state"].annotation))
     ego = {name for name in EgoModel.model_fields if not name.endswith("_sigma")}
-    assert set(rows("| field | | needs |")) == ego - {"left", "right"}
+    assert set(rows("| field | | needs |")) == ego - {"left", "right", "left_kind", "right_kind"}
+    what = rows("| field of a lane | |")
+    assert set(what) == {"kind", "kind_probability"} | {f"marking.{name}" for name in MarkingModel.model_fields}
+    for name, values in (("kind", BoundaryKind), ("marking.type", MarkingType), ("marking.color", MarkingColor)):
+        assert set(get_args(values)) <= set(re.findall(r"`(\w+)`", what[name][0]))
     assert {f"{name}_sigma" for name in rows("| field | | needs |")} <= set(EgoModel.model_fields)
     events = {
         event.model_fields["type"].default: set(event.model_fields) - {"type", "timestamp"}

@@ -69,6 +69,24 @@ def test_the_context_of_a_frame_comes_from_the_frames_before_it() -> None:
     assert columns == pytest.approx([319.5 - 1.15 * 215.0, 319.5 + 1.15 * 215.0], abs=1.0)
 
 
+def test_a_horizon_above_the_image_is_configured_or_estimated_and_restored() -> None:
+    detector = ScriptedDetector([(-0.2, 1.0)] * 4)
+    session = Session(detector, SessionOptions(horizon=-0.2))
+    result = session.process(fakes.picture(640, 360), 0.0, infer)
+    assert detector.contexts[0].horizon == pytest.approx(-72.0, abs=0.5)
+    assert result.horizon == pytest.approx(-72.0, abs=1.0)
+    session = Session(detector)
+    for frame in range(2):
+        result = session.process(fakes.picture(640, 360), 0.04 * frame, infer)
+    state = session.state
+    state.validate()
+    assert state.horizon == pytest.approx(-0.2)
+    restored = Session(detector)
+    restored.restore(state)
+    restored.process(fakes.picture(640, 360), 0.08, infer)
+    assert detector.contexts[-1].horizon == pytest.approx(-72.0)
+
+
 def test_a_configured_horizon_stays() -> None:
     detector = ScriptedDetector([(0.5, 1.0)] * 3)
     session = Session(detector, SessionOptions(horizon=0.3))

@@ -62,6 +62,21 @@ def test_departure_warnings_have_settings(monkeypatch: pytest.MonkeyPatch) -> No
     assert options.departure == DepartureSettings(vehicle_width=1.9, least_speed=0.0)
 
 
+@pytest.mark.parametrize("value", ["road_edge,marking", "road_edge\nmarking", ["road_edge", "marking"]])
+def test_kinds_are_a_string_or_a_list(value: Any) -> None:
+    assert load_settings(kinds=value).kinds == ("road_edge", "marking")
+    assert Settings().kinds == ("marking", "road_edge")
+
+
+@pytest.mark.parametrize("value", [",", [], "curb", "marking,curb"])
+def test_other_kinds_are_refused_on_one_line(value: Any) -> None:
+    with pytest.raises(
+        SettingsError, match=r"^--kinds = .*: (input should be 'marking' or 'road_edge'|tuple should)"
+    ) as caught:
+        load_settings(kinds=value)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_variable_can_name_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text("port = 1\n")
     monkeypatch.setenv("LANESTREAM_CONFIG", str(file))
@@ -230,7 +245,9 @@ def _row(name: str) -> str:
 
 
 def _shown(default: object) -> str:
-    return "" if default in (None, ()) else f"{default:.12g}" if isinstance(default, int | float) else str(default)
+    if isinstance(default, tuple):
+        return ", ".join(default)
+    return "" if default is None else f"{default:.12g}" if isinstance(default, int | float) else str(default)
 
 
 def test_the_memory_for_images_must_hold_an_image_of_each_caller() -> None:

@@ -8,12 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from lanestream.road.appearance import BoundaryKind
 from lanestream.road.curve import Curve, FloatArray, curve_basis
 
 
 @dataclass(frozen=True)
 class AnsweredLane:
-    """A reported boundary; its covariance (3, 3) belongs to the coefficients of `curve`, in image pixels."""
+    """A reported boundary; its covariance (3, 3) belongs to the coefficients of `curve`, in image pixels.
+
+    `type` and `color` are those of a marking; None of an edge of the road, and if they are not classified.
+    """
 
     track_id: int
     position: int
@@ -22,6 +26,9 @@ class AnsweredLane:
     covariance: FloatArray
     top: float
     bottom: float
+    kind: BoundaryKind = "marking"
+    type: str | None = None
+    color: str | None = None
 
     def covariance_at(self, rows: FloatArray) -> FloatArray:
         """Returns the covariance (R, R) of the columns at `rows` (R,)."""
@@ -102,6 +109,7 @@ class Answer:
 
 
 def _lane(lane: Mapping[str, Any]) -> AnsweredLane:
+    marking = lane.get("marking") or {}
     return AnsweredLane(
         track_id=lane["track_id"],
         position=lane["position"],
@@ -110,6 +118,10 @@ def _lane(lane: Mapping[str, Any]) -> AnsweredLane:
         covariance=np.asarray(lane["covariance"], dtype=float),
         top=lane["line"]["top"][1],
         bottom=lane["line"]["bottom"][1],
+        # A version that does not know kinds reports markings only.
+        kind=lane.get("kind", "marking"),
+        type=marking.get("type"),
+        color=marking.get("color"),
     )
 
 

@@ -127,6 +127,25 @@ def compare(truth: TruthFrame, answer: Answer, steady_rows: FloatArray) -> Frame
     )
 
 
+def without_edges(truth: TruthFrame, answer: Answer) -> Answer:
+    """Returns an answer without the reported edges of the road that are right, or that the truth says nothing about.
+
+    They are those that follow a true edge, closer than any marking, and those beyond the outermost true marking. All
+    others stay, as do reported markings, even on an edge.
+    """
+    if all(lane.kind == "marking" for lane in answer.lanes):
+        return answer
+    rows = truth.horizon + SHARES * (truth.bottom - truth.horizon)
+    lane_px = _lane_px(truth, rows)
+    x = _stack([lane.curve.x(rows) for lane in answer.lanes], len(rows))
+    true_x = _stack([lane.columns(rows) for lane in truth.lanes], len(rows))
+    edge_x = _stack([lane.columns(rows) for lane in truth.edges], len(rows))
+    to_marking, to_edge = _nearest(_distances(true_x, x, lane_px)), _nearest(_distances(edge_x, x, lane_px))
+    ignored = ((to_edge <= GATE) & (to_edge < to_marking)) | _beyond(true_x, x)
+    kept = (lane for i, lane in enumerate(answer.lanes) if lane.kind == "marking" or not ignored[i])
+    return replace(answer, lanes=tuple(kept))
+
+
 def consecutive(run: ClipRun) -> Iterator[tuple[FrameComparison, FrameComparison]]:
     """Yields the pairs of neighboring frames of the same scene."""
     for before, after in zip(run.frames, run.frames[1:], strict=False):
@@ -146,7 +165,10 @@ def rounded(value: float | None, digits: int = 4) -> float | None:
 
 def _without_points(truth: TruthFrame) -> TruthFrame:
     """Returns the truth without the points of its boundaries, which long runs have no memory for."""
-    return replace(truth, lanes=tuple(replace(lane, points=np.empty((0, 2))) for lane in truth.lanes))
+    lanes, edges = (
+        tuple(replace(lane, points=np.empty((0, 2))) for lane in group) for group in (truth.lanes, truth.edges)
+    )
+    return replace(truth, lanes=lanes, edges=edges)
 
 
 def _lane_px(truth: TruthFrame, rows: FloatArray) -> FloatArray:
@@ -166,6 +188,20 @@ def _distances(true_x: FloatArray, x: FloatArray, lane_px: FloatArray) -> FloatA
         if len(visible):
             distances[index] = (np.abs(x[:, visible] - columns[visible]) / lane_px[visible]).mean(axis=1)
     return distances
+
+
+def _nearest(distances: FloatArray) -> FloatArray:
+    """Returns the least of the distances (L, M) of each of M boundaries; infinite if none is known."""
+    return np.asarray(np.nan_to_num(distances, nan=np.inf).min(axis=0, initial=np.inf))
+
+
+def _beyond(true_x: FloatArray, x: FloatArray) -> NDArray[np.bool_]:
+    """Returns which of M boundaries lie outside all true ones over most of the lowest rows at which there is one."""
+    visible = np.flatnonzero(~np.isnan(true_x).all(axis=0))[:_COMPARED_ROWS]
+    if not len(visible):
+        return np.ones(len(x), bool)
+    left, right = np.nanmin(true_x[:, visible], axis=0), np.nanmax(true_x[:, visible], axis=0)
+    return np.asarray(((x[:, visible] < left).mean(axis=1) > 0.5) | ((x[:, visible] > right).mean(axis=1) > 0.5))
 
 
 def _pairs(distances: FloatArray) -> dict[int, int]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from lanestream_exporter.evaluation.tracking.accuracy import error_figures, lane_change_figures
+from lanestream_exporter.evaluation.tracking.appearance import appearance_figures
 from lanestream_exporter.evaluation.tracking.comparison import ClipRun, rounded
 from lanestream_exporter.evaluation.tracking.departures import departure_figures
 from lanestream_exporter.evaluation.tracking.gaps import gap_figures
@@ -17,7 +18,7 @@ from lanestream_exporter.evaluation.tracking.rendered import RenderedSet, Runs
 from lanestream_exporter.evaluation.tracking.roles import event_figures, role_figures
 from lanestream_exporter.evaluation.tracking.uncertainty import uncertainty_figures
 
-SCHEMA: Final = 1
+SCHEMA: Final = 2
 OVERALL: Final = "overall"
 
 # The groups of figures of rendered clips. A new group is one more entry here.
@@ -36,6 +37,7 @@ _GROUPS: Final[Mapping[str, Callable[[Sequence[ClipRun]], dict[str, Any]]]] = {
     "meters": meter_figures,
     "calibration": calibration_figures,
     "departure": departure_figures,
+    "appearance": appearance_figures,
 }
 
 

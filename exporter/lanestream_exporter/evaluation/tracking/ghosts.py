@@ -1,6 +1,7 @@
 """Tracks that follow nothing, what is left of the old scene after a cut, and jumps of tracks.
 
-Rendered truth is complete: a track without a true boundary near it follows nothing.
+Rendered truth is complete: a track without a true marking near it follows nothing, even if it is on an edge of the
+road. Tracks that are reported as edges are not counted.
 """
 
 from __future__ import annotations
@@ -79,8 +80,9 @@ def jump_figures(runs: Sequence[ClipRun]) -> dict[str, Any]:
 
 
 def is_ghost(frame: FrameComparison, index: int) -> bool:
-    """Whether the answer `index` of a frame has no true boundary within the gate."""
-    return not bool((frame.distances[:, index] <= GATE).any())
+    """Whether the answer `index` of a frame is a marking without a true one within the gate."""
+    is_marking = frame.answer.lanes[index].kind == "marking"
+    return is_marking and not bool((frame.distances[:, index] <= GATE).any())
 
 
 def old_id_frames(run: ClipRun, cut: int) -> int:

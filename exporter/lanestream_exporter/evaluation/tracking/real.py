@@ -28,6 +28,7 @@ from lanestream_exporter.evaluation.boundaries import (
 )
 from lanestream_exporter.evaluation.measuring import decoded_frames
 from lanestream_exporter.evaluation.tracking.answers import Answer
+from lanestream_exporter.evaluation.tracking.appearance import appearance_figures
 from lanestream_exporter.evaluation.tracking.comparison import (
     BOTTOM,
     FAR,
@@ -89,7 +90,9 @@ class _Road:
         """Returns the labels of a frame as truth; a frame without labels has no lanes. Heights are 1 by definition."""
         sides = (None, None) if labels is None else ego_sides(labels)
         lanes = [
-            TruthLane(side if lane.lane_id is None else lane.lane_id, side, lane.points)
+            TruthLane(
+                side if lane.lane_id is None else lane.lane_id, side, lane.points, type=lane.type, color=lane.color
+            )
             for side, lane in zip((-1, 1), sides, strict=True)
             if lane is not None
         ]
@@ -170,6 +173,7 @@ def _figures(run: RealRun, references: Sequence[Sequence[ReportedBoundary]]) -> 
         "both_ego": _share(both),
         "both_ego_second_half": _share(both[half:]),
         "errors": _errors(run.matches),
+        "appearance": appearance_figures([run.clip], after_s=0.0),
         "uncertainty": uncertainty_figures([run.clip]),
         "motion": {
             "jitter": jitter_figures(list(second_differences(run.clip))),
@@ -231,7 +235,12 @@ def _share(flags: Sequence[bool]) -> dict[str, Any]:
 
 
 def _reports(answer: Answer) -> list[ReportedBoundary]:
-    return [ReportedBoundary(lane.curve, lane.top, lane.bottom, lane.position, lane.track_id) for lane in answer.lanes]
+    return [
+        ReportedBoundary(
+            lane.curve, lane.top, lane.bottom, lane.position, lane.track_id, None, lane.kind, lane.type, lane.color
+        )
+        for lane in answer.lanes
+    ]
 
 
 def _detected(system: System, width: int) -> list[ReportedBoundary]:
@@ -241,7 +250,11 @@ def _detected(system: System, width: int) -> list[ReportedBoundary]:
     scaling = Scaling.to_working_width(width)
     return [
         ReportedBoundary(
-            scaling.curve_to_image(found.curve), scaling.to_image(found.top), scaling.to_image(found.bottom), 0
+            scaling.curve_to_image(found.curve),
+            scaling.to_image(found.top),
+            scaling.to_image(found.bottom),
+            0,
+            kind=found.appearance.kind,
         )
         for found in system.detector.last.boundaries
     ]

@@ -10,7 +10,7 @@ from multiprocessing import get_context
 from typing import Any
 
 from lanestream_exporter.evaluation.tracking.answers import Answer
-from lanestream_exporter.evaluation.tracking.comparison import ClipRun
+from lanestream_exporter.evaluation.tracking.comparison import ClipRun, without_edges
 from lanestream_exporter.evaluation.tracking.systems import Answerer, System, SystemSpec
 from lanestream_exporter.evaluation.tracking.truth import TruthFrame
 from lanestream_exporter.scenes.tracking_clips import sample_tracking_clip
@@ -86,7 +86,7 @@ def run_clip(systems: Mapping[str, System], kind: str, seed: int, calibrate: boo
         # Every system gets the frame before the first answer is waited for, so that processes work at the same time.
         pending = {name: answer(image, truth.timestamp) for name, answer in answerers.items()}
         for name, answer in pending.items():
-            runs[name].add(truth, Answer.from_message(answer()))
+            runs[name].add(truth, without_edges(truth, Answer.from_message(answer())))
     return runs
 
 

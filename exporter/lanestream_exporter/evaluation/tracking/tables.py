@@ -77,6 +77,14 @@ _RENDERED: Final[Mapping[str, Sequence[_Column]]] = {
         ("pitch deg", "calibration.pitch_deg.rms"),
         ("yaw deg", "calibration.yaw_deg.rms"),
     ),
+    "Kind, type and color after 2 s": (
+        ("values", "appearance.type.values"),
+        ("kind", "appearance.kind.share"),
+        ("type", "appearance.type.share"),
+        ("tracks", "appearance.type.track_share"),
+        ("color", "appearance.color.share"),
+        ("tracks", "appearance.color.track_share"),
+    ),
     "Departures": (
         ("crossings", "departure.crossings"),
         ("warned", "departure.warned"),
@@ -103,6 +111,8 @@ _REAL: Final[Sequence[_Column]] = (
     ("mad", "motion.jitter.mad_px_640"),
     ("lag bottom", "motion.lag.bottom.lag_frames"),
     ("0.3", "motion.lag.far.lag_frames"),
+    ("type", "appearance.type.share"),
+    ("color", "appearance.color.share"),
 )
 
 

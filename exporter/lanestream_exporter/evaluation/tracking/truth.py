@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lanestream.road.curve import FloatArray
+from lanestream_exporter.datasets.labels import ROAD_EDGE_TYPES
 
 # Rows this far beyond the ends of a boundary's points still count as inside: ends are rounded to whole rows.
 _SLACK = 1.0
@@ -18,7 +19,8 @@ _SLACK = 1.0
 class TruthLane:
     """A true boundary: `points` (N, 2) in image pixels, and the number of this hidden frame in its gap (0 if visible).
 
-    `gap_length` is the number of frames for which the boundary is hidden, 0 if it is visible.
+    `gap_length` is the number of frames for which the boundary is hidden, 0 if it is visible. `type` and `color` are
+    those of labels; None if unknown.
     """
 
     lane_id: int
@@ -26,6 +28,8 @@ class TruthLane:
     points: FloatArray
     gap: int = 0
     gap_length: int = 0
+    type: str | None = None
+    color: str | None = None
 
     def columns(self, rows: FloatArray) -> FloatArray:
         """Returns the columns (R,) at `rows` (R,), NaN where the boundary is outside the image."""
@@ -64,6 +68,7 @@ class TruthFrame:
 
     `scene` grows at a cut. `horizon` and `bottom` are the rows between which the road is compared. `camera` is the true
     camera as on the wire; `pitch` and `yaw` are its directions at rest in degrees, for clips whose truth has them.
+    `edges` are the edges of the road, which are not among the `lanes`.
     """
 
     index: int
@@ -79,11 +84,13 @@ class TruthFrame:
     lane_changes: tuple[TrueLaneChange, ...] = ()
     pitch: float | None = None
     yaw: float | None = None
+    edges: tuple[TruthLane, ...] = ()
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> TruthFrame:
         """Returns the truth in a record. Raises KeyError if a needed field is missing."""
         ego = record.get("ego") or {}
+        boundaries = tuple(map(_lane, record["lanes"]))
         return cls(
             index=record["frame"],
             timestamp=record["timestamp"],
@@ -100,16 +107,7 @@ class TruthFrame:
                 ego.get("lane_width_m"),
                 ego.get("lateral_speed"),
             ),
-            lanes=tuple(
-                TruthLane(
-                    lane["id"],
-                    lane["position"],
-                    np.asarray(lane["points"], dtype=float).reshape(-1, 2),
-                    int(lane.get("gap") or 0),
-                    int(lane.get("gap_length") or 0),
-                )
-                for lane in record["lanes"]
-            ),
+            lanes=tuple(lane for lane in boundaries if lane.type not in ROAD_EDGE_TYPES),
             lane_changes=tuple(
                 TrueLaneChange(event["lane_id"], event["direction"], event["timestamp"])
                 for event in record["events"]
@@ -117,4 +115,17 @@ class TruthFrame:
             ),
             pitch=record.get("truth_pitch"),
             yaw=record.get("truth_yaw"),
+            edges=tuple(lane for lane in boundaries if lane.type in ROAD_EDGE_TYPES),
         )
+
+
+def _lane(lane: Mapping[str, Any]) -> TruthLane:
+    return TruthLane(
+        lane["id"],
+        lane["position"],
+        np.asarray(lane["points"], dtype=float).reshape(-1, 2),
+        int(lane.get("gap") or 0),
+        int(lane.get("gap_length") or 0),
+        lane.get("type"),
+        lane.get("color"),
+    )

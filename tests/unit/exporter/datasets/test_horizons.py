@@ -26,6 +26,15 @@ def test_two_labels_show_the_horizon_they_share() -> None:
     assert shared_horizon([], HEIGHT, 140.0) == 140.0
 
 
+@pytest.mark.parametrize("horizon", [-200.0, -72.0, 10.0])
+def test_the_horizon_of_a_camera_that_looks_down_is_above_the_image(horizon: float) -> None:
+    curves = [Curve(horizon, (MIDDLE, slope, 900.0)) for slope in (-0.7, 0.6)]
+    rows = np.linspace(HEIGHT - 1.0, max(0.0, horizon + 12.0), 60)
+    lanes = [np.stack([curve.x(rows), rows], axis=1) for curve in curves]
+    assert shared_horizon(lanes, HEIGHT, None) == pytest.approx(horizon, abs=1.0)
+    assert shared_horizon(lanes[:1], HEIGHT, horizon + 2.0) == pytest.approx(horizon, abs=4.0)
+
+
 def test_a_road_unlike_the_model_keeps_the_horizon_of_its_drive() -> None:
     lanes = [points(LEFT), points(RIGHT)]
     # Labels that the model describes are believed even if the rest of the drive has another horizon.

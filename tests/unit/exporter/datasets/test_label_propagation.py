@@ -15,7 +15,7 @@ from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
 from lanestream_exporter.datasets.labels import PARTIAL, WHOLE, LabeledFrame
 from lanestream_exporter.datasets.manifest import DatasetCollection
-from lanestream_exporter.samples.patches import columns_at
+from lanestream_exporter.samples.truth import columns_at
 from lanestream_exporter.scenes import Drive, sample_clip, write_clip
 
 LAST = 12
@@ -43,6 +43,17 @@ def key_frames(clip: Path) -> tuple[dict[int, LabeledFrame], dict[int, LabeledFr
 
 def propagated(clip: Path, labeled: Mapping[int, LabeledFrame], stride: int = 4) -> list[LabeledFrame]:
     return [frame for frame, _ in LabelPropagation(stride).frames(clip / "drive.mp4", labeled)]
+
+
+def test_edges_of_the_road_are_not_propagated(clip: Path) -> None:
+    known, _ = key_frames(clip)
+    edges = {
+        index: replace(frame, lanes=(replace(frame.lanes[0], type="kerb"), *frame.lanes[1:]))
+        for index, frame in known.items()
+    }
+    frames = propagated(clip, edges)
+    assert [[lane.position for lane in frame.lanes] for frame in frames] == [[known[0].lanes[1].position]] * 2
+    assert {frame.coverage for frame in frames} == {PARTIAL}
 
 
 def test_propagated_labels_lie_on_the_paint(clip: Path) -> None:

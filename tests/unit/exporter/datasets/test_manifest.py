@@ -211,7 +211,7 @@ def test_the_fingerprint_changes_with_files_and_manifest(tmp_path: Path, draw: D
 
 def test_the_shipped_manifest_credits_every_data_set() -> None:
     datasets = DatasetCollection.open(SHIPPED_MANIFEST)
-    assert len(datasets.manifest.dataset) == 5
+    assert len(datasets.manifest.dataset) == 8
     assert all({"name", "license", "credit"} == record.keys() for record in datasets.credits())
 
 

@@ -95,9 +95,9 @@ def test_caltech_splines_are_sampled_and_count_from_zero(tmp_path: Path, draw: D
     # The midpoint of the cubic curve by De Casteljau.
     middle = np.array([1.0, 3.0, 3.0, 1.0]) / 8.0 @ control - 1.0
     np.testing.assert_allclose(curve.points[50], middle)
-    assert (curve.kind, curve.color, curve.lane_id) == ("double", "yellow", 7)
+    assert (curve.type, curve.color, curve.lane_id) == ("double", "yellow", 7)
     assert straight.points.tolist() == [[290.0, 170.0], [185.5, 100.0]]
-    assert (straight.kind, straight.color, straight.lane_id) == ("solid", "white", None)
+    assert (straight.type, straight.color, straight.lane_id) == ("solid", "white", None)
     assert second.lanes == ()
     assert first.group.endswith("/cordova1")
 
@@ -118,8 +118,8 @@ def test_labelme_strips_give_kind_color_and_id(tmp_path: Path, draw: Draw) -> No
     labelme(tmp_path / "ann" / "a.json", "..\\img\\monday\\a.jpg", downwards, other, flagged)
     (frame,) = read(tmp_path)
     assert points(frame) == [LEFT, RIGHT]
-    assert (frame.lanes[0].kind, frame.lanes[0].color, frame.lanes[0].lane_id) == ("dashed", "white", 3)
-    assert (frame.lanes[1].kind, frame.lanes[1].color) == (None, "yellow")
+    assert (frame.lanes[0].type, frame.lanes[0].color, frame.lanes[0].lane_id) == ("dashed", "white", 3)
+    assert (frame.lanes[1].type, frame.lanes[1].color) == (None, "yellow")
     assert frame.group == f"{tmp_path.name}/monday"
 
 
@@ -144,8 +144,8 @@ def test_cvat_images_give_attributes_and_groups(tmp_path: Path, draw: Draw) -> N
     one, two = read(tmp_path)
     assert points(one) == [RIGHT, LEFT]
     right, left = one.lanes
-    assert (right.kind, right.color, right.position, right.lane_id) == ("dashed", "white", 1, 5)
-    assert (left.kind, left.color, left.position, left.lane_id) == ("solid", "yellow", None, None)
+    assert (right.type, right.color, right.position, right.lane_id) == ("dashed", "white", 1, 5)
+    assert (left.type, left.color, left.position, left.lane_id) == ("solid", "yellow", None, None)
     assert (one.group, two.group) == ("task monday", f"{tmp_path.name}/tuesday")
 
 
@@ -182,7 +182,7 @@ def test_clip_labels_are_read_with_their_video(clip: Path) -> None:
     assert {frame.group for frame in frames} == {"drive"}
     for frame, record in zip(frames, written, strict=True):
         assert points(frame) == [lane["points"] for lane in record["lanes"]]
-        assert [lane.kind for lane in frame.lanes] == [lane["type"] for lane in record["lanes"]]
+        assert [lane.type for lane in frame.lanes] == [lane["type"] for lane in record["lanes"]]
 
 
 def test_a_video_is_found_next_to_the_folder_of_its_labels(tmp_path: Path, clip: Path) -> None:
@@ -200,7 +200,7 @@ def test_clip_labels_are_read_with_images(tmp_path: Path, draw: Draw) -> None:
     (frame,) = read(tmp_path)
     (lane,) = frame.lanes
     assert points(frame) == [LEFT]
-    assert (lane.lane_id, lane.position, lane.kind, lane.color) == (4, -1, "solid", "yellow")
+    assert (lane.lane_id, lane.position, lane.type, lane.color) == (4, -1, "solid", "yellow")
     assert (frame.group, frame.source) == ("road", "road.mp4#7")
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lanestream.detection.classification import Classification
+from lanestream.detection.features import Channels
 from lanestream.detection.proposals import Proposals
 from lanestream.road.curve import Curve, Curves
 from lanestream.road.view import RoadView, Spans
@@ -272,8 +274,9 @@ def test_candidates_under_both_rules() -> None:
     # Shifts of 10, 52 and 90 px are 6.7, 35 and 60 px across the line, at 1280 wide.
     shifts = (0.0, 10.0, 52.0, 90.0)
     spans = Spans(np.full(4, 252.0), np.full(4, 719.0), np.ones(4, bool))
-    proposals = Proposals(Curves.of([curve(-1.1, 640.0 + v) for v in shifts]), spans, view, 1.0, None)
-    outputs = np.array([[0.05, 0.95], [0.75, 0.25], [0.05, 0.95], [0.85, 0.15]], np.float32)
+    channels = Channels.of(np.zeros((720, 1280, 3), np.uint8))
+    proposals = Proposals(channels, Curves.of([curve(-1.1, 640.0 + v) for v in shifts]), spans, view, 1.0, None)
+    outputs = Classification.of(np.array([[0.05, 0.95], [0.75, 0.25], [0.05, 0.95], [0.85, 0.15]], np.float32))
     judged = judge(proposals, outputs, labels)
     figures = candidate_figures([FrameEvaluation(labels, (), judged)], 0.5)
     assert figures["far_40"]["confusion"] == {"tp": 1, "fp": 0, "fn": 1, "tn": 1}
@@ -291,7 +294,7 @@ def test_candidates_under_both_rules() -> None:
     assert decided["decided"]["far_40"]["confusion"] == {"tp": 2, "fp": 0, "fn": 0, "tn": 1}
     assert decided["far_40"] == figures["far_40"]
     reverse = replace(proposals, curves=proposals.curves.take([3, 2, 1, 0]))
-    ranked = candidate_figures([FrameEvaluation(labels, (), judge(reverse, outputs[:2], labels))], 0.5)
+    ranked = candidate_figures([FrameEvaluation(labels, (), judge(reverse, outputs.take(np.arange(2)), labels))], 0.5)
     assert ranked["far_30"]["candidates"] == 2, "only those that the classifier saw are judged"
     recall = ranked["proposal_recall"]["ego"]
     assert recall["labels"] == 2

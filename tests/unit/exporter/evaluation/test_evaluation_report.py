@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,18 @@ from documentation import table_keys
 
 from lanestream.engine import load_engine
 from lanestream.errors import LabelError
+from lanestream.road.appearance import BOUNDARY_KINDS
+from lanestream.road.curve import Curve
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.clips import read_clip_labels
 from lanestream_exporter.datasets.labels import WHOLE, LabeledFrame
 from lanestream_exporter.datasets.manifest import LabeledClip
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
-from lanestream_exporter.evaluation.boundaries import match_ego
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary, match_ego
+from lanestream_exporter.evaluation.gallery import drawn
 from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, ServedModel
+from lanestream_exporter.evaluation.outcomes import FrameEvaluation
 from lanestream_exporter.evaluation.report import write_report
 from lanestream_exporter.evaluation.tables import figure_tables
 from lanestream_exporter.evaluation_commands import evaluate as command
@@ -86,7 +91,11 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> LabeledClip:
 
 @pytest.fixture(scope="module")
 def evaluation(clip: LabeledClip) -> Evaluation:
-    frames = [still(seed) for seed in range(24, 28)]
+    frames = [
+        (replace(labels, dataset=f"set {seed % 2}", conditions={"light": "day"}), image)
+        for seed in range(24, 28)
+        for labels, image in [still(seed)]
+    ]
     methods = [ServedModel(load_engine(provider="cpu")), *map(Baseline, BASELINES)]
     return run_evaluation(methods, EvaluationSet("rendered", lambda: iter(frames), (clip,)))
 
@@ -128,14 +137,15 @@ def documented() -> set[str]:
         if part.startswith("|"):
             keys.update(key for base in bases for key in table_keys(part, base))
         else:
-            bases = re.findall(r"`((?:images|clips)\.[^`]*)`", part) or [""]
+            bases = re.findall(r"`((?:images|datasets|conditions|clips)\.[^`]*)`", part) or [""]
     return keys
 
 
 def written(value: Any, path: str = "") -> Iterator[str]:
     if isinstance(value, dict):
-        names = {"methods": "<method>", "images": "<method>", "clips": "<method>"}
+        names = dict.fromkeys(("methods", "images", "datasets", "conditions", "clips"), "<method>")
         names |= {"images.<method>": "<drive>", "clips.<method>": "<clip>"}
+        names |= {"datasets.<method>": "<dataset>", "conditions.<method>": "<condition>"}
         for key, part in value.items():
             yield from written(part, f"{path}.{names.get(path, key)}".lstrip("."))
     elif isinstance(value, list) and value and isinstance(value[0], dict):
@@ -175,7 +185,43 @@ def test_the_tables_name_every_method_and_drive(figures: dict[str, Any]) -> None
     made = list(figure_tables(figures))
     drives = len(figures["images"][BASELINES[0].name])
     assert drives == 5
-    assert [table.row_count for table in made] == [2 * drives, 2 * drives, 4 * drives, 8, 8, *[4 * drives] * 3]
+    sets, conditions, clips = 2, 1, 2
+    kinds = [4 * sets] * 2 + [4 * conditions] * 2 + [4 * drives, 4 * clips]
+    assert [table.row_count for table in made] == [
+        *kinds, 2 * drives, 2 * drives, 4 * drives, 4 * clips, 4 * clips, *[4 * drives] * 3
+    ]  # fmt: skip
+
+
+def test_data_sets_and_conditions_share_the_frames_among_them(figures: dict[str, Any]) -> None:
+    name = BASELINES[0].name
+    sets, conditions = figures["datasets"][name], figures["conditions"][name]
+    assert {part: groups["boundaries"]["ego"]["frames"] for part, groups in sets.items()} == {"set 0": 2, "set 1": 2}
+    whole = figures["images"][name][OVERALL]
+    assert conditions == {"light: day": {"boundaries": whole["boundaries"], "kinds": whole["kinds"]}}
+
+
+def test_the_report_begins_with_the_verdicts(evaluation: Evaluation, figures: dict[str, Any], tmp_path: Path) -> None:
+    page = write_report(tmp_path, evaluation, figures).read_text(encoding="utf-8")
+    first = page.index("<table>")
+    ego = figures["images"][evaluation.methods[0].name][OVERALL]["boundaries"]["ego"]
+    line = f"ego boundaries: {ego['right']} of {ego['right'] + ego['missed']} right, {ego['wrong']} wrong"
+    assert line in figures["verdicts"][0]
+    for verdict in figures["verdicts"]:
+        assert 0 < page.index(verdict.replace("'", "&#39;")) < first
+
+
+def test_the_gallery_shows_markings_as_lines_and_edges_as_dots() -> None:
+    labels, image = still(24)
+    curve = Curve(160.0, (320.0, 0.0, 0.0))
+    columns = {}
+    for kind in BOUNDARY_KINDS:
+        report = ReportedBoundary(curve, 200.0, 350.0, -1, kind=kind)
+        outcome = FrameEvaluation(replace(labels, lanes=()), (report,))
+        picture = drawn(np.zeros_like(image), outcome)
+        assert picture.shape[1] >= 640
+        columns[kind] = picture[:, 480].any(axis=1)[310:510]
+    assert columns["marking"].all()
+    assert 0.2 < columns["road_edge"].mean() < 0.8
 
 
 def test_a_dataset_without_labels_is_an_error() -> None:

@@ -14,6 +14,7 @@ from lanestream.road.crops import PatchGeometry
 from lanestream_exporter.alexnet import AlexNet, Shape, load_torchvision_weights
 from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
 from lanestream_exporter.exporting.classifier import ExportableClassifier
+from lanestream_exporter.exporting.exportable import ExportDescription
 from lanestream_exporter.training.run_files import read_checkpoint
 
 Weights = dict[str, Tensor]
@@ -25,7 +26,7 @@ FOREIGN = ForeignNetwork(("false", "lane"), PatchGeometry(224, half_width=0.4))
 def foreign_weights() -> Weights:
     """Returns weights as torchvision saves them, fine-tuned to two classes."""
     torch.manual_seed(0)
-    return AlexNet(batch_norm=False).state_dict()
+    return AlexNet(2, batch_norm=False).state_dict()
 
 
 @pytest.fixture
@@ -62,7 +63,7 @@ def test_torchvision_weights_initialize_the_network(tmp_path: Path) -> None:
     network = AlexNet()
     load_torchvision_weights(network, path)
     assert torch.equal(network.features[3].weight, source.features[3].weight)  # type: ignore[arg-type, union-attr]
-    assert network.classes == 2
+    assert network.outputs == 9
 
 
 def test_the_training_record_is_kept(saved: Any) -> None:
@@ -74,6 +75,18 @@ def test_the_training_record_is_kept(saved: Any) -> None:
     assert training == {**record, "step": 7, "figures": {"validation": 0.25}}
 
 
+@pytest.mark.parametrize("outputs", [2, 9])
+def test_a_network_keeps_its_outputs(saved: Any, outputs: int) -> None:
+    shape = Shape(size=112, width=0.1, hidden=8)
+    record = {"config": {"network": {"size": 112, "width": 0.1, "hidden": 8}}}
+    exportable, _ = read_network(saved({"network": AlexNet(outputs, shape).state_dict(), "record": record}))
+    assert isinstance(exportable, ExportableClassifier)
+    assert exportable.network.outputs == outputs
+    described = exportable.info(ExportDescription("own", "fp32", {}, {}))
+    assert described.outputs == outputs
+    assert len(described.types) == (4 if outputs == 9 else 0)
+
+
 def test_the_network_has_the_recorded_size(saved: Any) -> None:
     shape = Shape(size=112, width=0.25, hidden=32)
     record = {"config": {"network": {"size": 112, "width": 0.25, "hidden": 32}}}
@@ -81,7 +94,7 @@ def test_the_network_has_the_recorded_size(saved: Any) -> None:
     assert isinstance(exportable, ExportableClassifier)
     assert (exportable.network.shape, exportable.patch_geometry.size) == (shape, 112)
     with torch.inference_mode():
-        assert exportable.network(torch.zeros(1, 3, 112, 112)).shape == (1, 2)
+        assert exportable.network(torch.zeros(1, 3, 112, 112)).shape == (1, 9)
 
 
 @pytest.mark.parametrize("size", ["large", {"size": 20}, {"size": 112, "depth": 3}])
@@ -105,7 +118,7 @@ def test_a_foreign_network_needs_only_classes_and_patches(saved: Any, foreign_we
     assert isinstance(exportable, ExportableClassifier)
     assert (exportable.normalization, exportable.patch_geometry.half_width) == ("imagenet", 0.4)
     x = torch.randn(1, 3, 224, 224, generator=torch.Generator().manual_seed(1))
-    network = AlexNet(batch_norm=False).eval()
+    network = AlexNet(2, batch_norm=False).eval()
     network.load_state_dict(foreign_weights)
     with torch.inference_mode():
         assert torch.equal(exportable.network(x), network(x))
@@ -128,7 +141,7 @@ def test_networks_that_can_not_be_served_are_rejected(saved: Any, foreign_weight
         (short, "lacks features.3.bias"),
         (wider, "classifier.4.weight has the shape (100, 4096), expected (4096, 4096)"),
         (corrupt, "not finite"),
-        (many, "has 1000 classes"),
+        (many, "has 1000 outputs, but the service needs 9, or 2 of a network from elsewhere"),
         (vgg, "has features.12.weight"),
         ({"conv1.weight": torch.zeros(3)}, "not an AlexNet"),
         ({"network": foreign_weights, "step": 1}, "remove --classes and --patch"),

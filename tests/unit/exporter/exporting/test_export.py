@@ -12,12 +12,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from lanestream.detection.ego_prior import UNKNOWN_HORIZONS
 from lanestream.engine import load_engine
 from lanestream.errors import ExportError, ModelError
 from lanestream.inference.model_info import METADATA_KEY, ClassifierInfo, RegressorInfo
 from lanestream.inference.onnx_model import load
+from lanestream.road.appearance import MARKING_COLORS, MARKING_TYPES
 from lanestream.road.crops import PatchGeometry
-from lanestream_exporter.alexnet import AlexNet, Shape, normalize
+from lanestream_exporter.alexnet import AlexNet, ClassifierLogits, Shape, normalize
 from lanestream_exporter.exporting import export
 from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.compression import in_batches
@@ -88,10 +90,11 @@ def test_the_classifier_file_matches_pytorch_at_any_batch_size(classifier: Expor
     expected = in_batches(classifier.report.network.serving_module(), inputs).numpy()
     assert expected[:, 1].std() > 0.02
     outputs = model.run(inputs)
-    np.testing.assert_allclose(outputs.sum(axis=1), 1.0, atol=1e-5)
+    for part in np.split(outputs, [3, 7], axis=1):
+        np.testing.assert_allclose(part.sum(axis=1), 1.0, atol=1e-5)
     assert np.abs(outputs - expected).mean() < 0.3 * expected[:, 1].std()
     np.testing.assert_allclose(np.concatenate([model.run(p[None]) for p in inputs[:5]]), outputs[:5], atol=1e-4)
-    assert model.run(inputs[:0]).shape == (0, 2)
+    assert model.run(inputs[:0]).shape == (0, 9)
 
 
 def test_int8_is_compared_with_fp32_and_much_smaller(classifier: Exported) -> None:
@@ -129,7 +132,8 @@ def test_the_regressors_metrics_use_what_its_detector_reads(regressor: Exported)
     assert isinstance(exportable, ExportableRegressor)
     assert len(validation.images) == len(validation.contexts) == 2 * validation.frames
     assert {len(values) for values in validation.truth.values()} == {len(validation.images)}
-    assert len(validation.inputs) >= (1 + 6) * validation.frames  # an unknown horizon takes five more crops
+    # An unknown horizon takes a crop for each row that is tried, and one more.
+    assert len(validation.inputs) >= (2 + len(UNKNOWN_HORIZONS)) * validation.frames
     run = load(regressor.path).run
     good = replace(validation, truth={**validation.truth, "columns": exportable._read(run, validation)[0]})
     metrics = exportable.metrics(run, good)
@@ -168,16 +172,25 @@ def test_both_files_run_in_their_detectors(classifier: Exported, regressor: Expo
 def test_the_files_describe_themselves(classifier: Exported, regressor: Exported) -> None:
     info = load(classifier.path).info
     assert isinstance(info, ClassifierInfo)
-    assert (info.precision, info.classes, info.patch.size) == ("int8", ("false", "lane"), 112)
+    assert (info.precision, info.classes, info.patch.size) == ("int8", ("nothing", "marking", "road_edge"), 112)
+    assert (info.types, info.colors) == (MARKING_TYPES, MARKING_COLORS)
+    calibration = classifier.report.network.calibration
+    temperatures = info.temperature, info.type_temperature, info.color_temperature
+    assert temperatures == (calibration.temperature, calibration.type_temperature, calibration.color_temperature)
+    assert len({1.0, *temperatures}) == 4
     assert info.training == {
         "data": "none", "step": 7, "rank_energy": 0.9, "export_frames": "rendered scenes", "normalization": "contrast",
     }  # fmt: skip
     assert info.metrics["frame_count"] == 4
-    assert info.metrics["accuracy"] == pytest.approx(classifier.report.written.metrics["accuracy"], abs=1e-4)
+    for name in ("accuracy", "average_precision", "type_accuracy", "color_accuracy"):
+        assert info.metrics[name] == pytest.approx(classifier.report.written.metrics[name], abs=1e-4)
+        assert 0.0 <= info.metrics[name] <= 1.0
     assert info.threshold == classifier.report.network.calibration.threshold
     other = load(regressor.path).info
     assert isinstance(other, RegressorInfo)
     assert (other.road_crop.size, other.road_crop.detail_width, other.precision) == (160, 448, "fp32")
+    assert (other.kinds, other.outputs) == (("marking", "road_edge"), 17)
+    assert 0.0 <= other.metrics["kind_accuracy"] <= 1.0
     assert "onnxruntime" in other.exporter
 
 
@@ -212,14 +225,14 @@ def _other_network(_: Any, example: NDArray[np.uint8], path: Path, names: tuple[
     helper = onnx.helper
     input_name, output_name = names
     shape = helper.make_node("Shape", [input_name], ["shape"], start=0, end=1)
-    two = helper.make_node("Constant", [], ["two"], value_ints=[2])
-    both = helper.make_node("Concat", ["shape", "two"], ["size"], axis=0)
+    nine = helper.make_node("Constant", [], ["nine"], value_ints=[9])
+    both = helper.make_node("Concat", ["shape", "nine"], ["size"], axis=0)
     ones = helper.make_node("ConstantOfShape", ["size"], [output_name], value=helper.make_tensor("v", 1, [1], [1.0]))
     graph = helper.make_graph(
-        [shape, two, both, ones],
+        [shape, nine, both, ones],
         "certain",
         [helper.make_tensor_value_info(input_name, onnx.TensorProto.UINT8, ["N", *example.shape[1:]])],
-        [helper.make_tensor_value_info(output_name, onnx.TensorProto.FLOAT, ["N", 2])],
+        [helper.make_tensor_value_info(output_name, onnx.TensorProto.FLOAT, ["N", 9])],
     )
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), str(path))
 
@@ -244,6 +257,26 @@ def test_accuracy_beyond_the_tolerance_is_refused(classifier: Exported, lost: di
     assert "--rank-energy closer to 1 or --precision fp16 or fp32" in caught.value.hint
 
 
+def test_a_network_of_two_classes_from_elsewhere_is_exported(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = AlexNet(2, Shape(112, 0.2, 64), batch_norm=False).eval()
+    exportable = ExportableClassifier(network, ("false", "lane"), PatchGeometry(112), "imagenet")
+    made = exported(exportable, "fp32", tmp_path)
+    model, inputs = load(made.path), made.validation.inputs[:5]
+    expected = in_batches(made.report.network.serving_module(), inputs).numpy()
+    np.testing.assert_allclose(model.run(inputs), expected, atol=1e-4)
+    assert expected.shape == (5, 2)
+    assert isinstance(model.info, ClassifierInfo)
+    assert (model.info.classes, model.info.types, model.info.colors) == (("false", "lane"), (), ())
+    assert {"accuracy", "average_precision", "frame_count"} == set(model.info.metrics) & {
+        "accuracy",
+        "average_precision",
+        "frame_count",
+        "type_accuracy",
+        "color_accuracy",
+    }
+
+
 def test_a_foreign_network_keeps_its_own_normalization(classifier: Exported) -> None:
     exportable = classifier.report.network
     assert isinstance(exportable, ExportableClassifier)
@@ -253,7 +286,8 @@ def test_a_foreign_network_keeps_its_own_normalization(classifier: Exported) -> 
     pixels = (inputs / 255.0 - np.array(means)) / np.array(sigmas)
     with torch.inference_mode():
         x = torch.from_numpy(pixels.astype(np.float32)).permute(0, 3, 1, 2)
-        expected = torch.softmax(foreign.network(x), dim=1).numpy()
+        logits = ClassifierLogits.of(foreign.network(x))
+        expected = np.hstack([torch.softmax(each, dim=1) for each in (logits.kinds, logits.types, logits.colors)])
     np.testing.assert_allclose(in_batches(foreign.serving_module(), inputs).numpy(), expected, atol=1e-4)
     assert foreign.info(ExportDescription("foreign", "fp32", {}, {})).training == {"normalization": "imagenet"}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,17 @@ from lanestream.detection.ego_prior import RoadRegressor
 from lanestream.detection.interface import FrameContext, Infer, ModelRole
 from lanestream.detection.regression_detector import RegressionDetector
 from lanestream.errors import ExportError
+from lanestream.road.crops import PatchGeometry
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection
-from lanestream_exporter.alexnet import AlexNet, normalize
+from lanestream_exporter.alexnet import AlexNet, ClassifierLogits, Shape, normalize
 from lanestream_exporter.exporting import proof
+from lanestream_exporter.exporting.classifier import ExportableClassifier
 from lanestream_exporter.exporting.compression import truncate_layers
-from lanestream_exporter.exporting.exportable import Calibration, ValidationSet, fit_calibration
+from lanestream_exporter.exporting.exportable import Calibration, ValidationSet, fit_calibration, fit_temperature
 from lanestream_exporter.exporting.graph import contrast, imagenet, publish
 from lanestream_exporter.exporting.proof import compare_boundaries
+from lanestream_exporter.samples.truth import MARKING, NOTHING, ROAD_EDGE, UNKNOWN, UNSURE
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +132,80 @@ def test_calibration_finds_the_temperature_that_made_the_labels() -> None:
     found = fit_calibration(logits, labels)
     assert found.temperature == pytest.approx(2.5, rel=0.1)
     assert 0.3 < found.threshold < 0.6
+
+
+def test_the_threshold_of_three_classes_is_for_all_but_the_first() -> None:
+    rng = np.random.default_rng(2)
+    logits = rng.normal(0.0, 2.0, (20_000, 3))
+    probabilities = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+    labels = (rng.random((20_000, 1)) > probabilities.cumsum(axis=1)).sum(axis=1)
+    found = fit_calibration((1.7 * logits).astype(np.float32), labels)
+    assert found.temperature == pytest.approx(1.7, rel=0.05)
+    accepted = 1.0 - probabilities[:, 0] >= found.threshold
+    assert (accepted == (labels > 0)).mean() > 0.8
+    assert found.temperature == pytest.approx(fit_temperature((1.7 * logits).astype(np.float32), labels))
+
+
+# What patches may show, and their types and colors.
+TARGETS = (
+    (NOTHING, -1, -1),
+    (MARKING, 1, 0),
+    (ROAD_EDGE, -1, -1),
+    (MARKING | ROAD_EDGE, -1, 1),
+    (NOTHING | ROAD_EDGE, -1, -1),
+    (UNSURE, -1, -1),
+    (UNKNOWN, -1, -1),
+)
+
+
+def validation_of(targets: Sequence[tuple[int, int, int]]) -> ValidationSet:
+    return ValidationSet(1, (), (), np.zeros((len(targets), 64, 64, 3), np.uint8), {"targets": np.array(targets)})
+
+
+def metrics_of(targets: Sequence[tuple[int, int, int]], *outputs: Sequence[float]) -> dict[str, float]:
+    """Returns the metrics of a network with these outputs for patches with these targets."""
+    network = ExportableClassifier(AlexNet(shape=Shape(64, 0.1, 8), batch_norm=False), patch_geometry=PatchGeometry(64))
+    return network.metrics(lambda _: np.array(outputs, np.float32), validation_of(targets))
+
+
+def test_the_metrics_of_a_classifier_count_clear_candidates_and_known_types_and_colors() -> None:
+    nothing, marking, edge = (0.9, 0.1, 0.0), (0.1, 0.8, 0.1), (0.0, 0.1, 0.9)
+    dashed, solid, white = (0.1, 0.7, 0.1, 0.1), (0.7, 0.1, 0.1, 0.1), (0.9, 0.1)
+    kinds = (nothing, marking, edge, marking, marking, marking, marking)
+    right = metrics_of(TARGETS, *((*kind, *dashed, *white) for kind in kinds))
+    assert right["accuracy"] == right["average_precision"] == right["type_accuracy"] == 1.0
+    assert right["color_accuracy"] == 0.5  # of the two candidates with a known color one is yellow
+    confused = metrics_of(TARGETS, *((*kind, *solid, *white) for kind in (nothing, edge, edge, edge, *kinds[4:])))
+    assert confused["accuracy"] == 0.75
+    assert confused["type_accuracy"] == 0.0
+    missed = metrics_of(TARGETS, *((*kind, *dashed, *white) for kind in (edge, nothing, nothing, nothing, *kinds[4:])))
+    assert missed["accuracy"] == 0.0
+    unknown = metrics_of(TARGETS[:1], (*nothing, *dashed, *white))
+    assert unknown["accuracy"] == 1.0
+    assert np.isnan(unknown["average_precision"])
+    assert "type_accuracy" not in unknown
+
+
+def test_kinds_types_and_colors_are_calibrated_each_by_itself() -> None:
+    rng = np.random.default_rng(3)
+    targets = [(kind, int(rng.integers(4)), int(rng.integers(2))) for kind in (NOTHING, MARKING, ROAD_EDGE) * 40]
+    shape = Shape(64, 0.1, 8)
+    torch.manual_seed(0)
+    network = ExportableClassifier(AlexNet(shape=shape, batch_norm=False).eval(), patch_geometry=PatchGeometry(64))
+    validation = validation_of(targets)
+    validation.inputs[:] = rng.integers(0, 256, validation.inputs.shape)
+    with torch.inference_mode():
+        logits = ClassifierLogits.of(network.network(contrast(torch.from_numpy(validation.inputs))))
+    kinds = np.array([(NOTHING, MARKING, ROAD_EDGE).index(kind) for kind, *_ in targets])
+    found = network.calibrated(validation).calibration
+    expected = [
+        fit_temperature(values.numpy(), labels)
+        for values, labels in zip(
+            (logits.kinds, logits.types, logits.colors), (kinds, *np.array(targets).T[1:]), strict=True
+        )
+    ]
+    temperatures = [found.temperature, found.type_temperature, found.color_temperature]
+    assert temperatures == pytest.approx(expected, rel=1e-3)
 
 
 def test_equal_labels_give_the_default_calibration() -> None:

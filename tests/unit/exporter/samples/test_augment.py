@@ -1,4 +1,4 @@
-"""Augmentation is seeded, varies every patch on its own, and keeps labels true."""
+"""Augmentation is seeded, varies every patch on its own, and keeps its boundary."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ def patches() -> NDArray[np.uint8]:
     return np.stack([patch] * 12)
 
 
-def labels(value: int) -> NDArray[np.int64]:
-    return np.full(12, value)
+def all_are(is_boundary: bool) -> NDArray[np.bool_]:
+    """Returns that all patches show a boundary, or none."""
+    return np.full(12, is_boundary)
 
 
 def centers(patch: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -34,7 +35,9 @@ def centers(patch: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def test_the_same_seed_gives_the_same_patches_and_each_its_own(patches: NDArray[np.uint8]) -> None:
-    first, again, other = (augmented(patches, labels(1), Augmentation(), np.random.default_rng(s)) for s in (1, 1, 2))
+    first, again, other = (
+        augmented(patches, all_are(True), Augmentation(), np.random.default_rng(s)) for s in (1, 1, 2)
+    )
     assert (first.shape, first.dtype) == (patches.shape, np.uint8)
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
@@ -42,17 +45,19 @@ def test_the_same_seed_gives_the_same_patches_and_each_its_own(patches: NDArray[
 
 
 def test_shares_of_zero_change_nothing(patches: NDArray[np.uint8]) -> None:
-    np.testing.assert_array_equal(augmented(patches, labels(0), UNCHANGED, np.random.default_rng(0)), patches)
+    np.testing.assert_array_equal(augmented(patches, all_are(False), UNCHANGED, np.random.default_rng(0)), patches)
 
 
 def test_a_flip_mirrors(patches: NDArray[np.uint8]) -> None:
     always = UNCHANGED.model_copy(update={"flip": 1.0})
-    np.testing.assert_array_equal(augmented(patches, labels(1), always, np.random.default_rng(0)), patches[:, :, ::-1])
+    np.testing.assert_array_equal(
+        augmented(patches, all_are(True), always, np.random.default_rng(0)), patches[:, :, ::-1]
+    )
 
 
-def test_the_line_of_a_true_patch_stays_within_the_jitter(patches: NDArray[np.uint8]) -> None:
+def test_the_line_of_a_boundary_stays_within_the_jitter(patches: NDArray[np.uint8]) -> None:
     shares = UNCHANGED.model_copy(update={"flip": 0.5, "jitter": 3.0 / 224.0, "shear": 1.0})
-    moved = augmented(patches, labels(1), shares, np.random.default_rng(0))
+    moved = augmented(patches, all_are(True), shares, np.random.default_rng(0))
     off = np.array([centers(patch) - 111.5 for patch in moved])
     assert np.abs(off).max() <= 3.1
     assert np.abs(off).max(axis=1).mean() > 1.0  # they do move
@@ -60,11 +65,11 @@ def test_the_line_of_a_true_patch_stays_within_the_jitter(patches: NDArray[np.ui
     assert tilts.max() > 1.0  # and tilt
 
 
-def test_shear_tilts_false_patches_alone(patches: NDArray[np.uint8]) -> None:
+def test_shear_tilts_patches_without_a_boundary_alone(patches: NDArray[np.uint8]) -> None:
     shares = UNCHANGED.model_copy(update={"shear": 1.0})
-    tilted = augmented(patches, labels(0), shares, np.random.default_rng(0))
+    tilted = augmented(patches, all_are(False), shares, np.random.default_rng(0))
     assert max(np.ptp(centers(patch)) for patch in tilted) > 20.0
-    np.testing.assert_array_equal(augmented(patches, labels(1), shares, np.random.default_rng(0)), patches)
+    np.testing.assert_array_equal(augmented(patches, all_are(True), shares, np.random.default_rng(0)), patches)
 
 
 @pytest.mark.parametrize("corruption", sorted(Corruptions.model_fields))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from lanestream.road.crops import RoadCropGeometry
 from lanestream.road.curve import Curve
-from lanestream.road.view import Image, RoadView
+from lanestream.road.view import Image, RoadView, Scaling
 from lanestream_exporter.datasets.labels import WHOLE, LabeledFrame, LabeledLane
 from lanestream_exporter.samples.road_crops import SHARES, Warp, plain_warp, warped_road_crop
 from lanestream_exporter.samples.road_frames import RoadFrame, read_frames, write_frames
@@ -80,10 +81,67 @@ def test_a_warped_frame_has_its_paint_where_the_target_says(frame: RoadFrame, wa
     assert target.horizon == pytest.approx((view.horizon - seen.horizon) / seen.depth)
 
 
+def road_frame(*types: str | None, exhaustive: bool = True) -> RoadFrame:
+    """Returns a frame with the left and the right boundary, of these types."""
+    lanes = tuple(LabeledLane(points(curve), type=each) for curve, each in zip((LEFT, RIGHT), types, strict=False))
+    made = RoadFrame.of(LabeledFrame(WIDTH, HEIGHT, lanes, "drive", "drawn", WHOLE, "roads", HORIZON), road())
+    assert made is not None
+    return replace(made, exhaustive=exhaustive)
+
+
+@pytest.mark.parametrize(
+    ("types", "road_edge"),
+    [
+        (("kerb", "dashed"), [1.0, 0.0]),
+        (("solid", "edge"), [0.0, 1.0]),
+        ((None, "edge"), [-1.0, 1.0]),
+        (("edge",), [1.0, -1.0]),
+    ],
+)
+def test_the_target_has_the_kinds_of_the_boundaries(types: tuple[str | None, ...], road_edge: list[float]) -> None:
+    frame, geometry = road_frame(*types), RoadCropGeometry(64)
+    _, target = warped_road_crop(frame, geometry, Warp())
+    _, flipped = warped_road_crop(frame, geometry, Warp(flipped=True))
+    assert target.road_edge.tolist() == road_edge
+    assert flipped.road_edge.tolist() == road_edge[::-1]
+    assert target.presence.tolist() == [1.0, float(len(types) == 2)]
+    _, partly = warped_road_crop(replace(frame, exhaustive=False), geometry, Warp())
+    assert partly.road_edge.tolist() == road_edge
+
+
+def test_the_labeled_horizon_is_the_frames_even_without_lanes() -> None:
+    empty = RoadFrame.of(
+        LabeledFrame(1280, 720, (), "drive", "drawn", WHOLE, "roads", -90.0), np.zeros((720, 1280, 3), np.uint8)
+    )
+    assert empty is not None
+    assert empty.horizon == pytest.approx(Scaling(448.0 / 1280.0).to_working(-90.0))
+    assert empty.kinds == ()
+    _, target = warped_road_crop(empty, RoadCropGeometry(64), Warp())
+    assert target.presence.tolist() == [0.0, 0.0]
+    assert target.road_edge.tolist() == [-1.0, -1.0]
+
+
+def test_the_errors_of_an_assumed_horizon_are_those_that_are_trained_on(frame: RoadFrame) -> None:
+    """The rows that are tried for a new camera are so close that the nearest is within the errors of training."""
+    trained = max(abs(Warp.random(np.random.default_rng(seed)).assumed) for seed in range(400))
+    assert trained <= 0.25
+    shares = np.linspace(-0.5, 0.65, 47).tolist()
+    errors = [plain_warp(replace(frame, horizon=share * frame.height), known=False).assumed for share in shares]
+    assert np.abs(errors).max() < trained
+
+
 def test_a_plain_warp_takes_the_nearest_look_if_the_horizon_is_unknown(frame: RoadFrame) -> None:
     assert plain_warp(frame, known=True) == Warp()
     depth = frame.height - 1.0 - frame.horizon
     assert frame.horizon + plain_warp(frame, known=False).assumed * depth == pytest.approx(0.39 * frame.height)
+
+
+def test_frames_keep_their_kinds_and_their_data_set(tmp_path: Path) -> None:
+    frame = road_frame("kerb", None)
+    write_frames(tmp_path / "frames.npz", [frame])
+    (read,) = read_frames(tmp_path / "frames.npz")
+    assert read.kinds == frame.kinds == ("road_edge", None)
+    assert (read.dataset, read.exhaustive) == ("roads", True)
 
 
 def test_frames_are_read_from_their_file_as_they_were_written(frame: RoadFrame, tmp_path: Path) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 
 from lanestream.detection.ego_prior import RegressorOutput
@@ -18,17 +21,49 @@ def test_the_loss_is_lowest_at_the_truth() -> None:
         "columns": columns @ at_shares().T,
         "known": torch.ones(4, 2, len(SHARES)),
         "presence": torch.ones(4, 2),
+        "road_edge": torch.zeros(4, 2),
         "horizon": torch.zeros(4),
     }
-    log_sigma, presence = torch.full((4, 2, 3), -5.0), torch.full((4, 2), 8.0)
-    best = lateral_loss(RegressorPrediction(columns, log_sigma, presence, torch.zeros(4)), truth)
+    log_sigma, sure = torch.full((4, 2, 3), -5.0), torch.full((4, 2), 8.0)
+    right = RegressorPrediction(columns, log_sigma, sure, torch.zeros(4), -sure)
     for worse in (
-        RegressorPrediction(columns + 0.02, log_sigma, presence, torch.zeros(4)),
-        RegressorPrediction(columns, log_sigma + 2.0, presence, torch.zeros(4)),
-        RegressorPrediction(columns, log_sigma, -presence, torch.zeros(4)),
-        RegressorPrediction(columns, log_sigma, presence, torch.full((4,), 0.1)),
+        replace(right, columns=columns + 0.02),
+        replace(right, log_deviations=log_sigma + 2.0),
+        replace(right, presence=-sure),
+        replace(right, horizon=torch.full((4,), 0.1)),
+        replace(right, road_edge=sure),
     ):
-        assert lateral_loss(worse, truth) > best + 0.05
+        assert lateral_loss(worse, truth) > lateral_loss(right, truth) + 0.05
+
+
+def test_kinds_and_presences_count_where_they_are_known() -> None:
+    columns, sure = torch.zeros(1, 2, 3), torch.tensor([[9.0, -9.0]])
+    truth = {
+        "columns": columns @ at_shares().T,
+        "known": torch.ones(1, 2, len(SHARES)),
+        "presence": torch.tensor([[1.0, -1.0]]),
+        "road_edge": torch.tensor([[-1.0, 0.0]]),
+        "horizon": torch.zeros(1),
+    }
+    right = RegressorPrediction(columns, torch.full((1, 2, 3), -5.0), sure, torch.zeros(1), sure)
+    same = replace(right, presence=torch.tensor([[9.0, 9.0]]), road_edge=torch.tensor([[-9.0, -9.0]]))
+    assert lateral_loss(same, truth) == lateral_loss(right, truth)
+    wrong_kind = replace(right, road_edge=torch.tensor([[9.0, 9.0]]))
+    assert lateral_loss(wrong_kind, truth) == pytest.approx(float(lateral_loss(right, truth)) + 0.15 * 9.0, rel=1e-4)
+    nothing = {**truth, "road_edge": torch.full((1, 2), -1.0), "presence": torch.full((1, 2), -1.0)}
+    assert torch.isfinite(lateral_loss(right, nothing))
+
+
+def test_the_served_layout_is_the_one_that_the_service_reads() -> None:
+    raw = torch.randn(3, 17, generator=torch.Generator().manual_seed(1))
+    prediction = RegressorPrediction.of(raw)
+    for index, row in enumerate(prediction.served().numpy()):
+        output = RegressorOutput.of(row)
+        np.testing.assert_allclose(output.columns, prediction.columns[index], rtol=1e-6)
+        np.testing.assert_allclose(output.sigma, prediction.log_deviations[index].exp(), rtol=1e-6)
+        np.testing.assert_allclose(output.presence, torch.sigmoid(raw[index, 12:14]), rtol=1e-6)
+        np.testing.assert_allclose(output.road_edge, torch.sigmoid(raw[index, 15:17]), rtol=1e-6)
+        assert output.horizon == pytest.approx(float(raw[index, 14]))
 
 
 def test_deviations_are_interpolated_between_the_anchors() -> None:
@@ -51,4 +86,4 @@ def test_folding_keeps_the_function() -> None:
         folded = network.folded()
         assert not [module for module in folded.modules() if isinstance(module, norms)]
         np.testing.assert_allclose(folded(crops), network(crops), rtol=1e-3, atol=1e-3)
-        assert RegressorPrediction.of(folded(crops)).served().shape == (2, RegressorOutput.SIZE)
+        assert folded(crops).shape == RegressorPrediction.of(folded(crops)).served().shape == (2, 17)

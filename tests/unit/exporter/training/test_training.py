@@ -146,15 +146,33 @@ def test_schedules() -> None:
     assert [rate_at(stairs, step) for step in (9, 10, 20)] == pytest.approx([1e-3, 1e-4, 1e-5])
 
 
+def without_data(config: ClassifierConfig | RegressorConfig) -> dict[str, Any]:
+    """Returns a configuration without what the shipped recipes set on purpose: their data and the warm-up."""
+    return config.model_dump(exclude={"data": {"without", "regressor"}, "schedule": {"warm_up"}})
+
+
 def test_the_shipped_recipes_are_read() -> None:
-    assert read_config(Path("classifier"), ClassifierConfig) == ClassifierConfig()
+    classifier = read_config(Path("classifier"), ClassifierConfig)
+    assert without_data(classifier) == without_data(ClassifierConfig())
     regressor = read_config(Path("regressor"), RegressorConfig)
-    assert regressor.model_copy(update={"initial": None}) == RegressorConfig()
-    second = read_config(Path("regressor-second"), RegressorConfig)
-    assert (second.initial, second.steps) == ("runs/regressor/best.pt", regressor.steps)
-    assert read_config(Path("classifier-second"), ClassifierConfig).initial == "runs/classifier/best.pt"
-    third = read_config(Path("classifier-third"), ClassifierConfig)
-    assert (third.data.regressor, third.data.propagation_stride) == ("out/regressor.onnx", 5)
+    assert without_data(regressor) == without_data(RegressorConfig())
+    # Both leave out the same data set: the first run of a network shows what training on new roads is worth.
+    assert classifier.data.without == regressor.data.without
+    assert len(classifier.data.without) == 1
+    more = (
+        read_config(Path("classifier-second"), ClassifierConfig),
+        read_config(Path("regressor-second"), RegressorConfig),
+    )
+    assert [second.initial for second in more] == ["runs/classifier/best.pt", "runs/regressor/best.pt"]
+    for second in more:
+        assert second.data.without == ()
+        assert second.data.committee == ("out/classifier-first.onnx", "out/regressor-first.onnx")
+    fine = (
+        read_config(Path("classifier-finetune"), ClassifierConfig),
+        read_config(Path("regressor-finetune"), RegressorConfig),
+    )
+    assert [tuned.initial for tuned in fine] == ["shipped", "shipped"]
+    assert fine[0].data.regressor == "shipped"
     toy = read_config(Path("classifier-toy"), ClassifierConfig)
     assert (toy.data.propagation_stride, toy.data.manifest) == (0, None)
     published = read_config(CONFIG_FOLDER / "classifier-published.toml", ClassifierConfig)
@@ -178,6 +196,9 @@ def test_the_shipped_recipes_are_read() -> None:
             '[data]\nmanifest = "a.toml"\nreal_share = 0\nfinal_real_share = 0',
             "with a manifest real_share or final_real",
         ),
+        ("[data]\nhard_scenes = 9", "data: hard_scenes and committee are only accepted together"),
+        ('[data]\ncommittee = ["a.onnx", "b.onnx"]', "hard_scenes and committee are only accepted together"),
+        ('[data]\nhard_scenes = 9\ncommittee = ["a.onnx"]', "data.committee"),
         ("data = 3", "data = 3 is not accepted"),
         ("steps", "is not a TOML file"),
     ],

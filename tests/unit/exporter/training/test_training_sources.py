@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from lanestream.detection.interface import ModelRole
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR, load_engine
-from lanestream.errors import LabelError, ModelError
+from lanestream.errors import LabelError, ModelError, SettingsError
 from lanestream.inference.model_info import ClassifierInfo
-from lanestream_exporter.samples.patch_files import PatchCache, read_stores, write_store
-from lanestream_exporter.samples.patches import PatchMaker
+from lanestream_exporter.samples.cache import SAMPLES_VERSION
+from lanestream_exporter.samples.patch_files import RENDERED, PatchCache, read_stores, write_store
+from lanestream_exporter.samples.patches import Patches, PatchMaker
 from lanestream_exporter.samples.prior_regressor import load_prior_regressor
+from lanestream_exporter.samples.truth import MARKING, NOTHING, ROAD_EDGE
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.training.config import TrainingData
 from lanestream_exporter.training.data_sources import PatchFiles, frame_sources, open_datasets, patch_files
@@ -108,18 +110,65 @@ def test_rendered_scenes_are_spread_over_files_and_the_first_validates(tmp_path:
     (files,) = patch_files(data, None, cache, lambda more, total: calls.append((more, total)))
     assert sum(more for more, _ in calls) == calls[-1][1] == 5
     assert [path.name for path in (*files.check, *files.train)] == [
-        "rendered-64-4-0000-2.npz",
-        "rendered-64-4-0001-3.npz",
+        f"rendered-64-{SAMPLES_VERSION}-0000-2.npz",
+        f"rendered-64-{SAMPLES_VERSION}-0001-3.npz",
     ]
     source = files.read()
-    assert source.counts["train"] == len(source.train) > len(source.check) > 0
+    assert source.counts["train"]["patches"] == len(source.train) > 0
+    assert source.counts["check"]["sets"] == {RENDERED: len(source.check)}
 
 
-def test_a_source_without_false_patches_is_reported(tmp_path: Path) -> None:
-    path = tmp_path / "true.npz"
-    write_store(path, [(np.zeros((224, 224, 3), np.uint8), 1)])
-    with pytest.raises(LabelError, match="no false real patches to train on"):
-        PatchFiles("real", (path,), (path,)).read()
+def stored(path: Path, *targets: tuple[int, int, int]) -> Path:
+    """Writes black patches with these targets."""
+    write_store(path, [("mine", Patches(np.zeros((len(targets), 64, 64, 3), np.uint8), np.array(targets, np.int8)))])
+    return path
+
+
+def test_a_source_needs_patches_with_and_without_a_boundary(tmp_path: Path) -> None:
+    nothing = stored(tmp_path / "nothing.npz", (NOTHING, -1, -1))
+    edges = stored(tmp_path / "edges.npz", (ROAD_EDGE, -1, -1), (NOTHING | ROAD_EDGE, -1, -1))
+    with pytest.raises(LabelError, match="no real patches of boundaries to train on"):
+        PatchFiles("real", (nothing,), (edges,)).read()
+    with pytest.raises(LabelError, match="no real patches of anything else to validate with"):
+        PatchFiles("real", (nothing, edges), (edges,)).read()
+    PatchFiles("real", (nothing, edges), (edges, nothing)).read()
+
+
+def test_a_source_counts_its_patches(tmp_path: Path) -> None:
+    path = stored(
+        tmp_path / "all.npz",
+        (NOTHING, -1, -1),
+        (MARKING, 1, 0),
+        (MARKING, 3, -1),
+        (ROAD_EDGE, -1, -1),
+        (MARKING | ROAD_EDGE, -1, 1),
+    )
+    assert PatchFiles("real", (path,), (path,)).read().counts["train"] == {
+        "patches": 5, "nothing": 1, "marking": 2, "road_edge": 1,
+        "solid": 0, "dashed": 1, "double": 0, "dots": 1, "white": 1, "yellow": 1, "sets": {"mine": 5},
+    }  # fmt: skip
+
+
+def test_a_data_set_can_be_left_out(tmp_path: Path) -> None:
+    data = two_drives(tmp_path)
+    drive(tmp_path / "roads" / "other")
+    write_manifest(
+        tmp_path / "datasets.toml",
+        {"name": "one", "path": "roads/one", "split": "train"},
+        {"name": "other", "path": "roads/other", "split": "train"},
+        {"name": "three", "path": "roads/three", "split": "val"},
+    )
+
+    def groups(*without: str) -> set[str]:
+        chosen = data.model_copy(update={"without": without})
+        (source,) = frame_sources(chosen, open_datasets(chosen, tmp_path), tmp_path / "frames", lambda *_: None)
+        assert {(frame.dataset, frame.group) for frame in source.check} == {("three", "roads/three")}
+        return {frame.dataset for frame in source.train}
+
+    assert groups() == {"one", "other"}
+    assert groups("other") == {"one"}
+    with pytest.raises(SettingsError, match=r"the manifest has no data set 'two'.*its data sets are one, other, three"):
+        groups("two")
 
 
 def test_the_first_interrupt_is_a_request_and_the_second_interrupts() -> None:
@@ -142,7 +191,7 @@ def test_with_a_regressor_candidates_are_proposed_as_served(tmp_path: Path) -> N
     info = engine.main_model().info
     assert isinstance(info, ClassifierInfo)
     with_prior, alone = (
-        maker.proposed(still.image, still.labels, maker.propose(still.image))[0]
+        maker.proposed(still.image, still.labels, maker.propose(still.image)).pixels
         for maker in (PatchMaker(info.patch, load_prior_regressor(SHIPPED_REGRESSOR)), PatchMaker(info.patch))
     )
     (served,) = searched
@@ -154,7 +203,7 @@ def test_with_a_regressor_candidates_are_proposed_as_served(tmp_path: Path) -> N
     ]
     stores = [read_stores([path]) for path in paths]
     assert 0 < len(stores[0]) <= len(served)
-    assert list(stores[0].labels) != list(stores[1].labels)
+    assert stores[0].data.tolist() != stores[1].data.tolist()
 
 
 def test_a_file_that_is_not_a_regressor_is_reported(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import roads
 from numpy.typing import NDArray
 
 from lanestream.detection.curve_fit import Fits, FitSettings, fit_curves
+from lanestream.detection.features import Channels
 from lanestream.road.curve import ANCHORS, Curve, Curves
 from lanestream.road.view import Image, RoadView, visible_spans
 
@@ -43,7 +44,7 @@ def fit(
     sigma: Array | None = None,
 ) -> Fits:
     curves = Curves.of(start)
-    return fit_curves(gray, curves, visible_spans(curves, view), view, settings, sigma)
+    return fit_curves(roads.channels(gray), curves, visible_spans(curves, view), view, settings, sigma)
 
 
 def errors(fits: Fits, truth: Sequence[Curve], rows: Array) -> Array:
@@ -121,10 +122,56 @@ def test_what_is_known_well_moves_less() -> None:
 
 def test_a_frame_without_curves_has_no_fits() -> None:
     nothing = Curves.none(160.0)
-    fits = fit_curves(roads.draw_road(VIEW, []), nothing, visible_spans(nothing, VIEW), VIEW)
+    fits = fit_curves(roads.channels(roads.draw_road(VIEW, [])), nothing, visible_spans(nothing, VIEW), VIEW)
     assert len(fits.curves) == 0
     assert fits.covariances.shape == (0, 3, 3)
     assert fits.view == VIEW
+
+
+# --- Edges of the road ----------------------------------------------------------------------------------------------
+
+ASPHALT, KERB = (90, 90, 90), (140, 140, 140)
+# As bright as the asphalt in the paint channel.
+GRASS = (45, 100, 80)
+
+
+def fit_edges(image: Image, start: Sequence[Curve], are_edges: bool = True) -> Fits:
+    curves = Curves.of(start)
+    is_edge = np.full(len(start), are_edges)
+    return fit_curves(Channels.of(image), curves, visible_spans(curves, VIEW), VIEW, is_edge=is_edge)
+
+
+@pytest.mark.parametrize("beside", [KERB, GRASS], ids=["kerb", "grass"])
+@pytest.mark.parametrize("curvature", [0.0, 600.0, -1500.0])
+@pytest.mark.parametrize("off", [0.0, 0.04, -0.04])
+def test_edges_are_found_where_two_surfaces_meet(beside: tuple[int, int, int], curvature: float, off: float) -> None:
+    truth = on_road(-1.1, 1.2, curvature=curvature)
+    fits = fit_edges(roads.draw_surfaces(VIEW, truth, [beside, ASPHALT, beside]), moved(truth, off, off))
+    assert errors(fits, truth, np.concatenate([NEAR, FAR])).max() < 1.0
+    assert fits.paint.min() > 0.9
+
+
+def test_an_edge_is_fitted_to_the_step_and_a_marking_to_the_bar_beside_it() -> None:
+    edges, bars, between = on_road(-1.5, 1.5), on_road(-1.36, 1.36), on_road(-1.43, 1.43)
+    seam = roads.paint_on(roads.draw_surfaces(VIEW, edges, [GRASS, ASPHALT, GRASS]), VIEW, bars, width=0.05, paint=115)
+    assert errors(fit_edges(seam, between), edges, NEAR).max() < 3.0
+    assert errors(fit_edges(seam, between, are_edges=False), bars, NEAR).max() < 3.0
+
+
+def test_an_edge_is_not_moved_between_the_stripes_of_a_double_line_beside_it() -> None:
+    edge = on_road(1.2)
+    image = roads.draw_surfaces(VIEW, edge, [ASPHALT, (180, 180, 180)])
+    image = roads.paint_on(image, VIEW, on_road(1.3, 1.4), width=0.04, paint=220)
+    assert errors(fit_edges(image, edge), edge, NEAR).max() < 3.0
+
+
+def test_markings_and_edges_of_one_road_are_fitted_together() -> None:
+    markings, edge = on_road(-1.1, 1.0), on_road(1.6)
+    image = roads.paint_on(roads.draw_surfaces(VIEW, edge, [ASPHALT, GRASS]), VIEW, markings)
+    truth, is_edge = [*markings, *edge], np.array([False, False, True])
+    start = Curves.of(moved(truth, 0.04, -0.04, 0.04))
+    fits = fit_curves(Channels.of(image), start, visible_spans(start, VIEW), VIEW, is_edge=is_edge)
+    assert errors(fits, truth, np.concatenate([NEAR, FAR])).max() < 1.0
 
 
 # --- The common road ------------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def view_of(size: tuple[int, int]) -> RoadView:
 def fitted_position(gray: Image, view: RoadView, start: float, truth: float) -> float:
     """Returns how far the fit that began at `start` is from the position `truth`, over the nearer half of the road."""
     curves = Curves.of([curve_at(view, start)])
-    fit = fit_curves(gray, curves, visible_spans(curves, view), view).curves[0]
+    fit = fit_curves(roads.channels(gray), curves, visible_spans(curves, view), view).curves[0]
     u = np.linspace(0.3, 0.9, 20) * view.depth
     return float(np.abs((fit.x(view.horizon + u) - view.middle - CURVATURE / u) / u - truth).mean())
 

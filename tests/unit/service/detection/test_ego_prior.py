@@ -7,10 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 import roads
+from numpy.typing import NDArray
 
 from lanestream.detection.candidate_detector import CandidateDetector
+from lanestream.detection.classification import Classification
 from lanestream.detection.ego_prior import EgoPrior, LaneSpacing
-from lanestream.detection.features import paint_gray
+from lanestream.detection.features import Channels
 from lanestream.detection.interface import FrameContext
 from lanestream.detection.proposals import Proposals, propose
 from lanestream.road.curve import Curve, Curves
@@ -25,22 +27,35 @@ def lines(*positions: float) -> Curves:
     return Curves(150.0, np.array([[320.0, position, 0.0] for position in positions]).reshape(-1, 3))
 
 
-def prior_at(left: float | None, right: float | None, sigma: float = 0.05, presence: float = 0.98) -> EgoPrior:
+def prior_at(
+    left: float | None, right: float | None, sigma: float = 0.05, presence: float = 0.98, road_edge: float = 0.0
+) -> EgoPrior:
     seen = {side: position for side, position in ((-1, left), (1, right)) if position is not None}
     number = len(seen)
-    return EgoPrior(VIEW, tuple(seen), lines(*seen.values()), np.full((number, 2), sigma), np.full(number, presence))
+    of_each = np.full((number, 2), sigma), np.full(number, presence), np.full(number, road_edge)
+    return EgoPrior(VIEW, tuple(seen), lines(*seen.values()), *of_each)
 
 
-def test_boundaries_are_likelier_where_the_prior_saw_them_and_hardly_possible_in_the_lane() -> None:
-    odds = prior_at(-1.2, 1.2).odds(lines(-1.2, 1.2, 0.0))
-    assert odds[0] == pytest.approx(odds[1])
-    assert odds[0] > 10.0
-    assert odds[2] < 0.01
+def marking_odds(prior: EgoPrior, *positions: float) -> NDArray[np.float64]:
+    """Returns the factors by which the odds of lines at these positions to be markings change."""
+    return prior.odds(lines(*positions))[:, 0]
+
+
+def edge_odds(prior: EgoPrior, *positions: float) -> NDArray[np.float64]:
+    """Returns the factors by which the odds of lines at these positions to be edges of the road change."""
+    return prior.odds(lines(*positions))[:, 1]
+
+
+def test_markings_are_likelier_where_the_prior_saw_them_and_hardly_possible_in_the_lane() -> None:
+    left, right, inside = marking_odds(prior_at(-1.2, 1.2), -1.2, 1.2, 0.0)
+    assert left == pytest.approx(right)
+    assert left > 10.0
+    assert inside < 0.01
 
 
 def test_lanes_repeat_outside_the_ego_lane() -> None:
     prior = prior_at(-1.2, 1.2)
-    next_lane, between = prior.odds(lines(3.6, 2.4))
+    next_lane, between = marking_odds(prior, 3.6, 2.4)
     assert next_lane > 1.0
     # Half a lane outside the ego lane are walls and curbs: a line there must be more probable.
     assert between == pytest.approx(0.075, rel=0.05)
@@ -48,34 +63,69 @@ def test_lanes_repeat_outside_the_ego_lane() -> None:
     assert len(decided(prior, {-1.2: 0.9, 1.2: 0.9, 2.4: 0.97})) == 3
 
 
+def test_edges_of_the_road_may_be_anywhere_outside_the_lane() -> None:
+    prior = prior_at(-1.2, 1.2)
+    assert edge_odds(prior, -3.6, -2.4, -1.6, 1.6, 2.4, 3.6) == pytest.approx(1.0, abs=0.02)
+    assert edge_odds(prior, 0.0)[0] < 0.01
+    outside = decided(prior, {-1.2: 0.9, 1.2: 0.9}, edges={2.4: 0.6})
+    assert [each.appearance.kind for each in outside] == ["marking", "marking", "road_edge"]
+    assert len(decided(prior, {-1.2: 0.9, 1.2: 0.9}, edges={0.0: 0.9})) == 2
+
+
+def test_a_boundary_that_the_prior_saw_as_an_edge_is_likelier_to_be_one() -> None:
+    marking, mixed, edge = (prior_at(-1.2, 1.2, road_edge=share) for share in (0.0, 0.5, 1.0))
+    as_marking = [marking_odds(prior, 1.2)[0] for prior in (marking, mixed, edge)]
+    as_edge = [edge_odds(prior, 1.2)[0] for prior in (marking, mixed, edge)]
+    assert as_marking[0] > 10.0 > 1.0 > as_marking[2]
+    assert as_edge[2] > 10.0 > 1.0 > as_edge[0]
+    assert as_marking[1] == pytest.approx(0.5 * (as_marking[0] + as_marking[2]))
+    assert as_edge[1] == pytest.approx(0.5 * (as_edge[0] + as_edge[2]))
+
+
 def test_an_uncertain_prior_changes_odds_less() -> None:
-    certain, uncertain = (prior_at(-1.2, 1.2, sigma).odds(lines(1.2, 0.0)) for sigma in (0.05, 0.4))
+    certain, uncertain = (marking_odds(prior_at(-1.2, 1.2, sigma), 1.2, 0.0) for sigma in (0.05, 0.4))
     assert 1.0 < uncertain[0] < certain[0]
     assert certain[1] < uncertain[1] < 1.0
 
 
 def test_a_boundary_that_is_less_present_has_lower_odds() -> None:
-    present, absent = (prior_at(-1.2, 1.2, presence=presence).odds(lines(1.2))[0] for presence in (0.98, 0.3))
+    present, absent = (marking_odds(prior_at(-1.2, 1.2, presence=presence), 1.2)[0] for presence in (0.98, 0.3))
     assert 1.0 < absent < present
 
 
 def test_one_boundary_alone_says_nothing_of_the_lane() -> None:
-    odds = prior_at(-1.2, None).odds(lines(-1.2, 0.0, 1.2))
+    odds = marking_odds(prior_at(-1.2, None), -1.2, 0.0, 1.2)
     assert odds[0] > 10.0
     assert odds[1:] == pytest.approx(1.0, abs=0.02)
+    assert edge_odds(prior_at(-1.2, None), -1.2, 0.0, 1.2) == pytest.approx(1.0)
     assert prior_at(None, None).odds(lines(0.0)) == pytest.approx(1.0)
 
 
-def decided(prior: EgoPrior | None, probabilities: Mapping[float, float]) -> tuple[Detection, ...]:
-    """Returns the boundaries on a gray road if the classifier gives these probabilities to lines at these positions."""
-    curves = lines(*probabilities)
-    outputs = np.array([[1.0 - p, p] for p in probabilities.values()], np.float32)
-    proposals = Proposals(curves, visible_spans(curves, VIEW), VIEW, 1.0, prior)
-    return CandidateDetector(0.5).decide(np.full((360, 640), 90, np.uint8), proposals, outputs).boundaries
+def decided(
+    prior: EgoPrior | None, markings: Mapping[float, float], edges: Mapping[float, float] | None = None
+) -> tuple[Detection, ...]:
+    """Returns the boundaries on a gray road if the classifier gives these probabilities to lines at these positions.
+
+    The probabilities are those of markings, and of edges of the road.
+    """
+    of_edges = edges or {}
+    curves = lines(*markings, *of_edges)
+    kinds = np.array([[p, 0.0] for p in markings.values()] + [[0.0, p] for p in of_edges.values()])
+    gray = roads.channels(np.full((360, 640), 90, np.uint8))
+    proposals = Proposals(gray, curves, visible_spans(curves, VIEW), VIEW, 1.0, prior)
+    return CandidateDetector(0.5).decide(proposals, Classification(kinds)).boundaries
 
 
 def positions(detections: tuple[Detection, ...]) -> list[float]:
     return [detection.curve.coefficients[1] for detection in detections]
+
+
+def test_an_uncertain_edge_is_accepted_where_the_prior_saw_one() -> None:
+    prior = prior_at(-1.2, 1.2, road_edge=1.0)
+    assert len(decided(None, {}, edges={1.2: 0.3})) == 0
+    (edge,) = decided(prior, {}, edges={1.2: 0.3})
+    assert edge.appearance.kind == "road_edge"
+    assert edge.expected
 
 
 def test_a_line_in_the_lane_is_not_a_boundary_even_if_the_classifier_accepts_it() -> None:
@@ -122,31 +172,31 @@ def faint_road(curvature: float) -> tuple[Image, EgoPrior, list[Curve]]:
     """Returns a road of two lanes whose boundaries are hardly visible, a prior of the ego lane, and the boundaries."""
     curves = [Curve(150.0, (320.0, b, curvature * VIEW.depth**2)) for b in (-1.2, 1.2, 3.6)]
     image = roads.in_color(roads.draw_road(VIEW, curves, width=0.03, paint=roads.ROAD + 25, noise=4.0))
-    prior = EgoPrior(VIEW, (-1, 1), Curves.of(curves[:2]), np.full((2, 2), 0.05), np.ones(2))
+    prior = EgoPrior(VIEW, (-1, 1), Curves.of(curves[:2]), np.full((2, 2), 0.05), np.ones(2), np.zeros(2))
     return image, prior, curves
 
 
 @pytest.mark.parametrize("curvature", [0.0, 0.02])
 def test_the_boundaries_of_the_prior_and_their_neighbors_come_first(curvature: float) -> None:
     image, prior, curves = faint_road(curvature)
-    proposals = propose(paint_gray(image), FrameContext(), prior, None, 4)
-    assert len(proposals.curves) == 4
+    proposals = propose(Channels.of(image), FrameContext(), prior, None)
+    first = proposals.curves.take(np.arange(4))
     assert proposals.view.horizon == pytest.approx(VIEW.horizon, abs=7.0)
     rows = np.array([200.0, 250.0])
     for curve in curves:
-        assert np.abs(proposals.curves.x(rows) - curve.x(rows)).max(axis=1).min() < 6.0
+        assert np.abs(first.x(rows) - curve.x(rows)).max(axis=1).min() < 6.0
 
 
 def test_a_prior_without_boundaries_changes_no_candidates() -> None:
-    gray = paint_gray(faint_road(0.0)[0])
-    plain, with_prior = (propose(gray, FrameContext(), prior, None) for prior in (None, prior_at(None, None)))
+    channels = Channels.of(faint_road(0.0)[0])
+    plain, with_prior = (propose(channels, FrameContext(), prior, None) for prior in (None, prior_at(None, None)))
     assert list(plain.curves) == list(with_prior.curves)
 
 
 def test_a_prior_without_boundaries_still_shows_the_horizon() -> None:
-    bare, context = np.full((360, 640), 100, np.uint8), FrameContext(horizon=150.0)
+    bare, context = roads.channels(np.full((360, 640), 100, np.uint8)), FrameContext(horizon=150.0)
     nothing = Curves.none(180.0)
-    prior = EgoPrior(RoadView(640, 360, 180.0), (), nothing, np.empty((0, 2)), np.empty(0))
+    prior = EgoPrior(RoadView(640, 360, 180.0), (), nothing, np.empty((0, 2)), np.empty(0), np.empty(0))
     assert propose(bare, context, prior, None).view.horizon == pytest.approx(180.0, abs=7.0)
     assert propose(bare, context, None, None).view.horizon == pytest.approx(150.0, abs=7.0)
 
@@ -154,8 +204,8 @@ def test_a_prior_without_boundaries_still_shows_the_horizon() -> None:
 def test_tracked_boundaries_come_after_those_of_the_prior_and_before_lines() -> None:
     image, prior, _ = faint_road(0.0)
     tracked = lines(-0.6)
-    without = propose(paint_gray(image), FrameContext(150.0), prior, None).curves
-    curves = propose(paint_gray(image), FrameContext(150.0, tracked), prior, None).curves
+    without = propose(Channels.of(image), FrameContext(150.0), prior, None).curves
+    curves = propose(Channels.of(image), FrameContext(150.0, tracked), prior, None).curves
     rows = np.linspace(180.0, 359.0, 20)  # the search finds another horizon, near which curves differ
     place = int(np.abs(curves.x(rows) - tracked.x(rows)).max(axis=1).argmin())
     np.testing.assert_allclose(curves[place].x(rows), tracked[0].x(rows), atol=0.1)

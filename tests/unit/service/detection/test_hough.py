@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lanestream.detection.features import find_edges, paint_gray
+from lanestream.detection.features import Channels, find_edges
 from lanestream.detection.hough import hough_lines
 
 
@@ -75,7 +75,10 @@ def test_edges_above_the_top_row_are_not_searched_for() -> None:
     assert set(np.round(edges.angle) % 360.0) <= {0.0, 180.0}
 
 
-def test_white_and_yellow_paint_is_bright_in_the_gray_image() -> None:
+def test_white_and_yellow_paint_is_bright_in_the_paint_channel_and_grass_is_dark_in_the_blue_one() -> None:
     concrete, white, yellow = (150, 150, 150), (230, 230, 230), (80, 210, 230)
-    gray = paint_gray(np.array([[concrete, white, yellow]], np.uint8))[0].tolist()
-    assert gray[0] < min(gray[1:]) - 50
+    grass = (60, 170, 130)
+    channels = Channels.of(np.array([[concrete, white, yellow, grass]], np.uint8))
+    paint, blue = channels.paint[0].tolist(), channels.blue[0].tolist()
+    assert paint == [150, 230, 220, 150]
+    assert blue == [150, 230, 80, 60]

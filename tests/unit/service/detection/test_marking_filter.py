@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lanestream.detection.features import find_edges
 from lanestream.detection.hough import hough_lines
 from lanestream.detection.marking_filter import bar_contrast, find_ridges
-from lanestream.detection.vanishing_point import SearchRange, find_lines, refine, vote_of_lines
+from lanestream.detection.vanishing_point import KNOWN_HORIZON, WIDE, SearchRange, find_lines, refine, vote_of_lines
 from lanestream.road.curve import VanishingPoint
 
 WIDTH, HEIGHT = 640, 360
@@ -69,6 +69,18 @@ def test_hough_lines_meet_at_the_vanishing_point(known: bool) -> None:
     found = vote_of_lines(lines, WIDTH, HEIGHT, 160.0 if known else None)
     assert (found.x, found.y) == pytest.approx((330.0, 160.0), abs=4.0)
     assert found.weight > 0.5
+
+
+@pytest.mark.parametrize("row", [-72.0, -30.0, 20.0, 60.0])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_vanishing_point_may_be_above_the_image(row: float, known: bool) -> None:
+    truth = point(330.0, row)
+    road = drawn_road(truth)
+    lines = hough_lines(find_edges(road, 150), WIDTH, BOTTOM)
+    voted = vote_of_lines(lines, WIDTH, HEIGHT, row if known else None)
+    assert (voted.x, voted.y) == pytest.approx((330.0, row), abs=6.0)
+    found = refine(voted, find_ridges(road, voted), WIDTH, BOTTOM, KNOWN_HORIZON if known else WIDE)
+    assert (found.x, found.y) == pytest.approx((330.0, row), abs=12.0)
 
 
 def test_without_lines_the_vanishing_point_is_the_usual_one() -> None:

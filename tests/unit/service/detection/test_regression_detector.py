@@ -17,7 +17,7 @@ from lanestream.detection.ego_prior import (
     RegressorOutput,
     RoadRegressor,
 )
-from lanestream.detection.features import paint_gray
+from lanestream.detection.features import Channels
 from lanestream.detection.interface import Detections, FrameContext, ModelRole
 from lanestream.detection.regression_detector import RegressionDetector, fit_output
 from lanestream.road.crops import PatchGeometry
@@ -34,11 +34,16 @@ REGRESSOR = RoadRegressor(0.5)
 DETECTOR = RegressionDetector(REGRESSOR)
 
 
-def output_for(view: RoadView, presence: tuple[float, float] = (0.9, 0.9), horizon: float = 0.0) -> Outputs:
-    """Returns the output (15,) of a network that sees the road's boundaries in `view`, and its `horizon` in depths."""
+def output_for(
+    view: RoadView,
+    presence: tuple[float, float] = (0.9, 0.9),
+    horizon: float = 0.0,
+    road_edge: tuple[float, float] = (0.1, 0.1),
+) -> Outputs:
+    """Returns the output (17,) of a network that sees the road's boundaries in `view`, and its `horizon` in depths."""
     rows = view.horizon + REGRESSOR_ANCHORS * view.depth
     columns = [(curve.x(rows) - VIEW.middle) / WIDTH for curve in (LEFT, RIGHT)]
-    return np.concatenate([*columns, np.full(6, 0.01), presence, [horizon]]).astype(np.float32)
+    return np.concatenate([*columns, np.full(6, 0.01), presence, [horizon], road_edge]).astype(np.float32)
 
 
 def off_the_paint(sigma: float) -> Outputs:
@@ -72,7 +77,7 @@ class FakeRegressor:
 def mirrored(output: Outputs) -> Outputs:
     """Returns what the network outputs for the mirror image of a crop for which it returns `output`."""
     left, right, left_sigma, right_sigma = np.split(output[:12], 4)
-    return np.concatenate([-right, -left, right_sigma, left_sigma, output[[13, 12, 14]]])
+    return np.concatenate([-right, -left, right_sigma, left_sigma, output[[13, 12, 14, 16, 15]]])
 
 
 def detect(output: Outputs, horizon: float = HORIZON) -> Detections:
@@ -88,22 +93,30 @@ def test_an_output_is_read_as_the_curves_it_was_made_of() -> None:
 def test_the_output_of_a_mirrored_crop_is_mirrored_back() -> None:
     output = off_the_paint(0.02)
     output[6:12] = np.linspace(0.01, 0.06, 6)
-    output[12:15] = 0.7, 0.8, 0.1
+    output[12:17] = 0.7, 0.8, 0.1, 0.2, 0.9
     straight, back = RegressorOutput.of(output), RegressorOutput.of(mirrored(output)).mirrored
     mean = straight.mean(back)
-    for name in ("columns", "sigma", "presence", "horizon"):
+    for name in ("columns", "sigma", "presence", "horizon", "road_edge"):
         np.testing.assert_allclose(getattr(back, name), getattr(straight, name), rtol=1e-6)
         np.testing.assert_allclose(getattr(mean, name), getattr(straight, name), rtol=1e-6)
 
 
+def test_an_older_network_knows_only_markings() -> None:
+    older = RegressorOutput.of(output_for(VIEW, road_edge=(0.9, 0.9))[:15])
+    assert older.road_edge.tolist() == [0.0, 0.0]
+    assert older.presence == pytest.approx([0.9, 0.9])
+    assert {each.appearance.kind for each in detect(output_for(VIEW)[:15]).boundaries} == {"marking"}
+
+
 @pytest.mark.parametrize(("sigma", "calls"), [(0.01, 1), (0.03, 2)])
 def test_an_uncertain_network_gets_the_mirrored_crop_too(sigma: float, calls: int) -> None:
-    output = output_for(VIEW)
+    output = output_for(VIEW, road_edge=(0.2, 0.9))
     output[6:12] = sigma
     infer = FakeRegressor(output)
     prediction, _ = REGRESSOR.predict(ROAD, HORIZON, infer)
     assert len(infer.inputs) == calls
     np.testing.assert_allclose(prediction.columns, RegressorOutput.of(output).columns, rtol=1e-5)
+    np.testing.assert_allclose(prediction.road_edge, RegressorOutput.of(output).road_edge, rtol=1e-5)
     if calls == 2:
         np.testing.assert_array_equal(infer.inputs[1][0], infer.inputs[0][0, :, ::-1])
 
@@ -173,11 +186,24 @@ def test_boundaries_of_which_the_network_is_certain_are_moved_by_less() -> None:
 
 
 def test_only_the_wanted_sides_are_fitted() -> None:
-    output, gray = RegressorOutput.of(off_the_paint(0.03)), paint_gray(ROAD)
+    output, channels = RegressorOutput.of(off_the_paint(0.03)), Channels.of(ROAD)
     for wanted, expected in (([0, 1], [0, 1]), ([1], [1]), ([], [])):
-        sides, fits = fit_output(gray, output, VIEW, 0.5, wanted)
+        sides, fits = fit_output(channels, output, VIEW, 0.5, wanted)
         assert sides == expected
         assert len(fits.curves) == len(expected)
+
+
+def test_edges_of_the_road_are_fitted_to_the_surfaces_beside_them() -> None:
+    grass, asphalt = (45, 100, 80), (90, 90, 90)
+    image = roads.draw_surfaces(VIEW, [LEFT, RIGHT], [grass, asphalt, grass])
+    output = output_for(VIEW, road_edge=(0.9, 0.8))
+    output[:6] += 0.012
+    found = DETECTOR.detect(image, FrameContext(HORIZON), FakeRegressor(output)).boundaries
+    assert [each.appearance.kind for each in found] == ["road_edge", "road_edge"]
+    assert [each.appearance.road_edge for each in found] == pytest.approx([0.9, 0.8])
+    rows = np.array([260.0, 200.0])
+    for detection, curve in zip(found, (LEFT, RIGHT), strict=True):
+        np.testing.assert_allclose(detection.curve.x(rows), curve.x(rows), atol=2.5)
 
 
 # --- The prior ------------------------------------------------------------------------------------------------------
@@ -193,6 +219,11 @@ def test_a_boundary_that_is_absent_is_not_in_the_prior() -> None:
     assert len(prior.curves) == len(prior.sigma) == len(prior.presence) == 1
     assert prior.curves[0].coefficients == pytest.approx(LEFT.coefficients, rel=1e-3)
     assert prior_of(output_for(VIEW, presence=(0.1, 0.2))).sides == ()
+
+
+def test_the_prior_has_the_kinds_of_its_boundaries() -> None:
+    assert prior_of(output_for(VIEW, road_edge=(0.1, 0.9))).road_edge == pytest.approx([0.1, 0.9])
+    assert prior_of(output_for(VIEW, presence=(0.1, 0.9), road_edge=(0.1, 0.9))).road_edge == pytest.approx([0.9])
 
 
 def test_a_boundary_that_is_too_uncertain_is_not_in_the_prior() -> None:
@@ -212,7 +243,7 @@ Distance = Callable[[Curve], float]
 def nearest(output: Outputs, tracked: Curves | None = None) -> tuple[Curves, Distance]:
     """Returns the candidates, and a function that returns the greatest distance of the nearest one from a curve."""
     context = FrameContext(HORIZON, tracked)
-    curves = CANDIDATES.propose(ROAD, paint_gray(ROAD), context, FakeRegressor(output)).curves
+    curves = CANDIDATES.propose(ROAD, context, FakeRegressor(output)).curves
 
     def distance(curve: Curve) -> float:
         return float(np.abs(curves.x(ROWS) - curve.x(ROWS)).max(axis=1).min())

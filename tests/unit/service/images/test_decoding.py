@@ -8,11 +8,14 @@ import sys
 import zlib
 
 import fakes
+import numpy as np
 import pytest
 
 from lanestream.errors import ImageError, ImageTooLargeError
 from lanestream.images.decoding import ImageLimits, decode, decode_reduced
 from lanestream.images.header import Header, read_header
+
+import cv2  # isort: skip  (lanestream.images sets OpenCV's own limit before it is imported)
 
 LIMITS = ImageLimits()
 KINDS = {".jpg": "JPEG", ".png": "PNG", ".webp": "WebP"}
@@ -69,6 +72,40 @@ def test_the_size_of_an_extended_webp_is_read() -> None:
     size = (1280 - 1).to_bytes(3, "little") + (720 - 1).to_bytes(3, "little")
     data = b"RIFF" + (22).to_bytes(4, "little") + b"WEBPVP8X" + (10).to_bytes(4, "little") + bytes(4) + size
     assert summary(read_header(data)) == ("WebP", 1280, 720)
+
+
+JPEG_VARIANTS = {
+    "baseline": [],
+    "progressive": [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
+    "restarts": [cv2.IMWRITE_JPEG_RST_INTERVAL, 3],
+    "4:2:0": [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420],
+}
+
+
+@pytest.mark.parametrize("variant", JPEG_VARIANTS)
+@pytest.mark.parametrize("bottom", [128, 0, 255])
+def test_a_jpeg_without_its_end_marker_is_read_if_it_has_all_pixels(variant: str, bottom: int) -> None:
+    picture = np.full((96, 160, 3), bottom, np.uint8)
+    picture[:64] = np.random.default_rng(4).integers(0, 255, (64, 160, 3), np.uint8)
+    data = cv2.imencode(".jpg", picture, JPEG_VARIANTS[variant])[1].tobytes()
+    expected = decode(data, LIMITS)
+    for end in (data[:-2], data[:-1], data[:-1] + b"\xff"):
+        np.testing.assert_array_equal(decode(end, LIMITS), expected)
+        np.testing.assert_array_equal(decode_reduced(end, LIMITS, 80).image, decode_reduced(data, LIMITS, 80).image)
+    for size in range(len(data) // 2, len(data) - 8, 1 + len(data) // 400):
+        with pytest.raises(ImageError, match="cut short"):
+            decode(data[:size], LIMITS)
+
+
+def test_a_turned_jpeg_without_its_end_is_refused_if_pixels_are_missing() -> None:
+    picture = np.random.default_rng(4).integers(0, 255, (96, 160, 3), np.uint8)
+    data = cv2.imencode(".jpg", picture)[1].tobytes()
+    for turn in range(1, 9):
+        exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([turn]) + bytes(6)
+        turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
+        assert decode(turned[:-2], LIMITS).shape == ((96, 160, 3) if turn < 5 else (160, 96, 3))
+        with pytest.raises(ImageError, match="cut short"):
+            decode(turned[:-500], LIMITS)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -89,6 +89,11 @@ def test_a_configured_pitch_fixes_the_horizon() -> None:
     row = camera.horizon(lens, 360)
     column = float(lens.pixels(np.array([math.tan(math.radians(2.0)), 0.0]))[0])
     assert math.degrees(camera.pitch_at(lens, column, row)) == pytest.approx(3.0, abs=0.01)
+    down = Camera(1.4, 60.0, pitch=26.0)
+    row = down.horizon(down.lens(FRAME, (640, 360)), 360)
+    assert row == pytest.approx(179.5 - 320.0 / math.tan(math.radians(30.0)) * math.tan(math.radians(26.0)))
+    assert row < -0.2 * 360, "above the image"
+    assert math.degrees(down.pitch_at(down.lens(FRAME, (640, 360)), 319.5, row)) == pytest.approx(26.0)
     assert Camera(1.4, 60.0, pitch=60.0).horizon(lens, 360) == -360.0, "no detector places a horizon higher"
     assert Camera(1.4, 60.0, pitch=-20.0).horizon(lens, 360) == pytest.approx(0.95 * 360)
 

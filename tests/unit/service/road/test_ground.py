@@ -136,6 +136,17 @@ def test_any_camera_measures_the_same_road(
     assert ego["lateral_speed"] == pytest.approx(0.25 * 1.4)
 
 
+def test_a_camera_that_looks_down_measures_the_same_road() -> None:
+    camera = Camera(1.4, focal_length=(FOCAL, FOCAL), image_size=SIZE, roll=1.0)
+    a, b = 0.5 / 700.0, math.tan(math.radians(0.8))
+    result = result_of(camera, {1: (a, b, 1.9), 2: (a, b, -1.6)}, pitch=25.0)
+    assert result.horizon < -0.2 * SIZE[1], "above the image"
+    ego = values(ego_of(in_meters(result, camera)))
+    assert (ego["left"], ego["right"]) == pytest.approx((1.9, 1.6), abs=0.01)
+    assert ego["heading"] == pytest.approx(0.8, abs=0.15)
+    assert ego["curvature"] == pytest.approx(1.0 / 700.0, abs=2e-4)
+
+
 def test_a_principal_point_that_is_given_leaves_no_heading_bias() -> None:
     actual = Camera(1.4, 62.0, principal_point=(659.5, 359.5), image_size=SIZE)
     result = result_of(actual, {1: (0.0, 0.0, 1.75), 2: (0.0, 0.0, -1.75)})

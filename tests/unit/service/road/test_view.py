@@ -57,6 +57,15 @@ def test_visible_rows_end_where_the_curve_leaves_the_image() -> None:
     assert visible_rows(Curve(160.0, (-500.0, -1.0, 0.0)), VIEW, 0.1) is None
 
 
+def test_below_a_horizon_above_the_image_curves_are_visible_from_its_first_row() -> None:
+    view = RoadView(640, 360, -72.0)
+    assert (view.row_at(0.1), view.highest_row(0.1)) == (pytest.approx(-28.9), 0.0)
+    assert view.highest_row(0.5) == view.row_at(0.5)
+    assert visible_rows(Curve(-72.0, (320.0, 0.5, 0.0)), view) == (0.0, 359.0)
+    top, bottom = visible_rows(Curve(-72.0, (320.0, 1.0, 0.0)), view) or (-1.0, -1.0)
+    assert (top, bottom) == (0.0, pytest.approx(319.0 - 72.0, abs=6.0))
+
+
 def test_of_a_curve_that_leaves_and_comes_back_the_near_part_is_visible() -> None:
     back = Curve(160.0, (900.0, -2.0, -6000.0))
     top, bottom = visible_rows(back, VIEW, 0.1) or (0.0, 0.0)

@@ -621,7 +621,7 @@ async def test_sessions_are_limited_in_rate_per_caller() -> None:
         (("size",), [640, 0], "side of the images"),
         (("size",), [640, 480], "does not fit the size of the images"),
         (("size",), None, "does not fit the size of the images"),
-        (("horizon",), 1.5, "horizon is 1.5; expected -1 to 0.98"),
+        (("horizon",), 1.5, "horizon is 1.5; expected -2 to 0.98"),
         (("evidence",), -1.0, "evidence"),
         (("departure", "side"), "left", "a departure has a side exactly if"),
         (("departure", "right", "margin"), 1e7, "departure margin"),

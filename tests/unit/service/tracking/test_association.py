@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lanestream.tracking.association import _UNMATCHED, associate
+from lanestream.tracking.association import _UNMATCHED, associate, kind_costs
 
 Array = NDArray[np.float64]
 Pairs = list[tuple[int, int]]
@@ -77,3 +77,20 @@ def test_a_detection_too_far_away_or_too_unlikely_is_not_matched() -> None:
     assert matched([0.0], [FARTHEST - 0.01], cost_of_distance=1.0) == [(0, 0)]
     assert matched([0.0], [FARTHEST + 0.01], cost_of_distance=1.0) == []
     assert matched([0.0], [0.5], cost_of_distance=30.0) == []
+
+
+def test_of_two_detections_the_one_of_the_same_kind_belongs_to_a_track() -> None:
+    places, apart = np.array([0.0]), np.array([[0.1, -0.12]])
+    costs = _UNMATCHED - 5.0 + 10.0 * apart**2
+    assert associate(places, costs, apart, FARTHEST) == [(0, 0)]
+    for track, detections in ((0.05, (0.95, 0.02)), (0.95, (0.05, 0.9))):
+        kinds = kind_costs(np.array([track]), np.array(detections))
+        assert associate(places, costs + kinds, apart, FARTHEST) == [(0, 1)]
+
+
+def test_an_only_detection_belongs_to_a_track_of_the_other_kind() -> None:
+    apart = np.array([[0.1]])
+    kinds = kind_costs(np.array([0.0]), np.array([1.0]))
+    assert np.isfinite(kinds).all()
+    assert associate(np.array([0.0]), _UNMATCHED - 5.0 + kinds, apart, FARTHEST) == [(0, 0)]
+    assert (kind_costs(np.zeros(3), np.zeros(2)) == np.zeros((3, 2))).all(), "models without road edges"

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from lanestream.road.appearance import Appearance
 from lanestream.road.results import Detection, FrameResult, LaneChange, SceneCut
 from lanestream.road.view import RoadView
 from lanestream.tracking.road_filter import COLUMN, OWN, PITCH, ROAD
@@ -59,11 +60,19 @@ def wild_scene(i: int) -> tuple[list[Detection], float, RoadView, bool]:
             view=view,
             probability=float(rng.uniform(0.5, 1.0)),
             paint=float(rng.uniform(0.0, 1.0)),
+            appearance=wild_appearance(rng),
         )
         for b in places
         if abs(b) < 4.5 and rng.uniform() < 0.85
     ]
     return seen, DT * i + float(rng.choice([0.0, 0.01, -0.05])), view, i in (40, 95)
+
+
+def wild_appearance(rng: np.random.Generator) -> Appearance:
+    """Returns any appearance, now and then that of a model that does not classify markings."""
+    types, colors = (tuple(rng.dirichlet(np.full(number, 0.3)).tolist()) for number in (4, 2))
+    road_edge = float(rng.beta(0.3, 0.9))
+    return Appearance(road_edge, types, colors) if rng.uniform() < 0.8 else Appearance(road_edge)
 
 
 def step(tracker: LaneTracker, i: int) -> FrameResult:
@@ -122,7 +131,8 @@ def test_the_state_of_eight_boundaries_is_small() -> None:
     rng = np.random.default_rng(0)
 
     def scene(_: int) -> list[Detection]:
-        return [detection(b + rng.normal(0.0, 0.01)) for b in (-4.6, -3.3, -2.0, -0.7, 0.7, 2.0, 3.3, 4.6)]
+        places = (-4.6, -3.3, -2.0, -0.7, 0.7, 2.0, 3.3, 4.6)
+        return [detection(b + rng.normal(0.0, 0.01), appearance=wild_appearance(rng)) for b in places]
 
     for i in range(30):
         # A stream that began long ago, with wrong timestamps.
@@ -150,8 +160,9 @@ SIZE = ROAD + 3 * OWN
 def with_tracks(**fields: object) -> TrackerState:
     """Returns a state whose tracks have other values: of all of them, or a tuple of each."""
     tracks = np.frombuffer(b64decode(STATE.tracks), _TRACK).copy()
-    for name, value in fields.items():
-        tracks[name] = value
+    with np.errstate(over="ignore"):
+        for name, value in fields.items():
+            tracks[name] = value
     return replace(STATE, tracks=b64encode(tracks.tobytes()).decode())
 
 
@@ -237,6 +248,14 @@ def test_valid_states_are_accepted() -> None:
         (with_tracks(side=0), "side"),
         (with_tracks(state=3), "the state of a track is 3; expected 0 to 2"),
         (with_tracks(frames=0), "number of hits is 0"),
+        (with_tracks(road_edge=1.5), "road_edge is 1.5"),
+        (with_tracks(road_edge=NAN), "road_edge is nan"),
+        (with_tracks(types=(2.0, -1.0, 0.0, 0.0)), "types is 2.0"),
+        (with_tracks(types=(1.0, 1.0, 0.0, 0.0)), "sum of types is 2.0"),
+        (with_tracks(types=NAN), "types is nan"),
+        (with_tracks(types=INFINITY), "types is inf"),
+        (with_tracks(colors=(0.5, 0.25)), "sum of colors is 0.75"),
+        (with_tracks(colors=(NAN, 1.0)), "colors is nan"),
         (replace(STATE, tracks="!"), "not valid base 64"),
         (replace(STATE, tracks=STATE.tracks + "Ä"), "not valid base 64"),
         (replace(STATE, tracks="AAAA"), f"has 3 bytes; expected a multiple of {_TRACK.itemsize}"),
@@ -267,6 +286,16 @@ def test_an_invalid_state_is_refused_with_a_reason_on_one_line(state: TrackerSta
     assert len(str(error.value)) < 200
 
 
+def test_tracks_of_the_version_before_kinds_are_refused() -> None:
+    """So their session begins anew. They had 64 bytes, and five of them have as many bytes as four now."""
+    for number in range(1, 13):
+        tracks = b64encode(bytes(64 * number)).decode()
+        size = ROAD + OWN * number
+        numbers = b64encode(np.zeros(size + size * (size + 1) // 2, _NUMBER).tobytes()).decode()
+        with pytest.raises(ValueError, match=r"packed array|which are not those of"):
+            replace(STATE, tracks=tracks, filter=numbers).validate()
+
+
 def test_too_many_tracks_are_refused() -> None:
     number = 33
     tracks = np.repeat(np.frombuffer(b64decode(with_tracks(track_id=0).tracks), _TRACK)[:1], number)
@@ -295,7 +324,9 @@ def test_a_filter_that_diverges_begins_anew() -> None:
 
 
 NUMBERS = st.sampled_from([0.0, 1.0, -1.0, 1e-30, 1e30, 5e5, -5e5, NAN]) | st.floats(-1e6, 1e6)
-OF_A_TRACK = st.sampled_from(["born", "crossed", "probability", "top", "bottom", "place", "scale", "paint"])
+OF_A_TRACK = st.sampled_from(
+    ["born", "crossed", "probability", "top", "bottom", "place", "scale", "paint", "road_edge", "types", "colors"]
+)
 OF_A_TRACKER = st.sampled_from(["horizon", "depth", "mean_horizon", "lane_width", "activity"])
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from drives import DT, LANE, VIEW, bottom_columns, detection, drive, ids, road
 
+from lanestream.road.appearance import MARKING_TYPES, Appearance, BoundaryKind
 from lanestream.road.curve import Curve
 from lanestream.road.results import Detection, EgoLane, Event, FrameResult, LaneChange, SceneCut
 from lanestream.road.view import RoadView, visible_rows
@@ -545,3 +546,138 @@ def test_tracked_curves_are_those_of_confirmed_boundaries() -> None:
 def test_a_result_without_detections_is_empty() -> None:
     result = LaneTracker().update([], 0.0, VIEW)
     assert (result.lanes, result.ego, result.events, result.road) == ((), EgoLane(), (), None)
+
+
+# --- Kinds ------------------------------------------------------------------------------------------------------------
+
+DASHED = Appearance(0.03, (0.04, 0.9, 0.03, 0.03), (0.95, 0.05))
+SOLID = Appearance(0.03, (0.9, 0.04, 0.03, 0.03), (0.95, 0.05))
+EDGE = Appearance(0.95, (0.25,) * 4, (0.5, 0.5))
+METER = LANE / 3.5  # in row offsets
+
+
+def edged_road(offset: float = 0.0, apart_m: float = 0.6) -> list[Detection]:
+    """Returns a lane with a dashed marking on its left, and a solid one on its right with the road's edge beyond it."""
+    right = 1.15 + offset
+    return [
+        detection(-1.15 + offset, appearance=DASHED),
+        detection(right, appearance=SOLID),
+        detection(right + apart_m * METER, paint=0.0, appearance=EDGE),
+    ]
+
+
+def kinds(result: FrameResult) -> list[str]:
+    return [lane.appearance.kind for lane in result.lanes]
+
+
+def type_of(result: FrameResult, index: int = 0) -> str:
+    types = result.lanes[index].appearance.types
+    assert types is not None
+    return MARKING_TYPES[types.index(max(types))]
+
+
+@pytest.mark.parametrize("apart_m", [0.3, 0.6, 1.1])
+def test_a_marking_and_the_edge_beside_it_are_two_boundaries(apart_m: float) -> None:
+    results = drive(LaneTracker(), 60, lambda _: edged_road(0.0, apart_m))
+    assert {tuple(ids(result)) for result in results[2:]} == {(1, 2, 3)}
+    assert {tuple(kinds(result)) for result in results[2:]} == {("marking", "marking", "road_edge")}
+    last = results[-1]
+    assert [lane.position for lane in last.lanes] == [-1, 1, 2]
+    assert (last.ego.left, last.ego.right, last.ego.left_kind, last.ego.right_kind) == (1, 2, "marking", "marking")
+    assert last.ego.offset is not None
+    assert last.ego.offset.value == pytest.approx(0.0, abs=0.02)
+
+
+def test_two_markings_as_close_are_one() -> None:
+    results = drive(LaneTracker(), 30, lambda _: [*edged_road()[:2], detection(1.15 + 0.6 * METER, appearance=SOLID)])
+    assert len(results[-1].lanes) == 2
+
+
+def test_an_edge_that_comes_later_gets_its_own_identity() -> None:
+    results = drive(LaneTracker(), 60, lambda i: edged_road()[: 2 if i < 30 else 3])
+    assert ids(results[29]) == [1, 2]
+    assert ids(results[-1]) == [1, 2, 3]
+
+
+def test_a_hidden_marking_does_not_move_to_the_edge_beside_it() -> None:
+    def scene(i: int) -> list[Detection]:
+        return [one for number, one in enumerate(edged_road()) if number != 1 or not 40 <= i < 65]
+
+    results = drive(LaneTracker(), 90, scene)
+    assert {tuple(ids(result)) for result in results[2:]} == {(1, 2, 3)}
+    columns = np.array([bottom_columns(result) for result in results[10:]])
+    assert np.abs(columns - columns[0]).max() < 8.0
+    assert results[64].lanes[1].state == "predicted"
+
+
+def test_without_a_marking_the_edge_bounds_the_ego_lane() -> None:
+    results = drive(LaneTracker(), 30, lambda _: [edged_road()[0], edged_road()[2]])
+    assert (results[-1].ego.left_kind, results[-1].ego.right_kind) == ("marking", "road_edge")
+    assert drive(LaneTracker(), 5, lambda _: road(0.0, (1,)))[-1].ego.left_kind is None
+
+
+def test_the_type_of_a_boundary_changes_with_the_road_and_not_with_a_frame() -> None:
+    def scene(i: int) -> list[Detection]:
+        wrong = i == 60
+        return [detection(-1.15, appearance=SOLID if i >= 100 or wrong else DASHED), detection(1.15, appearance=SOLID)]
+
+    results = drive(LaneTracker(), 140, scene)
+    assert {type_of(result) for result in results[2:100]} == {"dashed"}
+    changed = next(i for i in range(100, 140) if type_of(results[i]) == "solid")
+    assert 103 <= changed <= 125
+    assert {type_of(result) for result in results[changed:]} == {"solid"}
+    assert ids(results[-1]) == [1, 2]
+
+
+def test_a_hidden_boundary_becomes_less_certain() -> None:
+    results = drive(LaneTracker(), 80, lambda i: edged_road()[: 2 if i < 50 else 1])
+    before, after = (results[i].lanes[1].appearance for i in (49, 79))
+    assert before.types is not None
+    assert after.types is not None
+    assert max(after.types) < max(before.types) - 0.05
+    assert after.road_edge > before.road_edge
+
+
+def test_of_a_single_image_kinds_are_those_of_the_detections() -> None:
+    result = LaneTracker(single_image=True).update(edged_road(), 0.0, VIEW)
+    assert kinds(result) == ["marking", "marking", "road_edge"]
+    assert [type_of(result, i) for i in (0, 1)] == ["dashed", "solid"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "reported", "right"),
+    [(("marking",), [1, 2], 2), (("road_edge",), [3], 3), (("marking", "road_edge"), [1, 2, 3], 2)],
+)
+def test_only_the_kinds_asked_for_are_reported(
+    chosen: tuple[BoundaryKind, ...], reported: list[int], right: int
+) -> None:
+    result = drive(LaneTracker(kinds=chosen), 20, lambda _: edged_road())[-1]
+    assert ids(result) == reported
+    assert result.ego.right == right
+    assert result.ego.left == (1 if "marking" in chosen else None)
+    alone = LaneTracker(single_image=True, kinds=chosen).update(edged_road(), 0.0, VIEW)
+    assert len(alone.lanes) == len(reported)
+
+
+def test_a_lane_change_over_an_unreported_boundary_is_not_reported() -> None:
+    def scene(i: int) -> list[Detection]:
+        return [detection(b - 0.02 * i, appearance=EDGE) for b in (-1.15, 1.15, 3.45)]
+
+    assert len(events(drive(LaneTracker(), 90, scene))) == 1
+    assert events(drive(LaneTracker(kinds=("marking",)), 90, scene)) == []
+
+
+def test_a_restored_tracker_reports_the_kinds_it_is_asked_for() -> None:
+    tracker = LaneTracker(kinds=("marking",))
+    drive(tracker, 20, lambda _: edged_road())
+    other = LaneTracker.restored(tracker.state, kinds=("road_edge",))
+    assert ids(drive(other, range(20, 22), lambda _: edged_road())[-1]) == [3]
+
+
+def test_what_is_reported_does_not_change_tracking() -> None:
+    wide = [*edged_road(), detection(-1.15 - 0.9 * METER, paint=0.0, appearance=EDGE)]
+    trackers = [LaneTracker(kinds=chosen) for chosen in (("marking", "road_edge"), ("marking",), ("road_edge",))]
+    for tracker in trackers:
+        drive(tracker, 40, lambda _: wide)
+    assert trackers[0].state == trackers[1].state == trackers[2].state
+    assert trackers[0].state.lane_width == pytest.approx(LANE, abs=0.05)

@@ -11,6 +11,7 @@ import pytest
 from trackingruns import FPS, LANE_WIDTH, PAIR, Reported, TrueLane, run
 
 from lanestream_exporter.evaluation.tracking.accuracy import error_figures, lane_change_figures
+from lanestream_exporter.evaluation.tracking.appearance import appearance_figures
 from lanestream_exporter.evaluation.tracking.comparison import ClipRun
 from lanestream_exporter.evaluation.tracking.departures import departure_figures
 from lanestream_exporter.evaluation.tracking.gaps import gap_figures
@@ -218,7 +219,7 @@ def test_a_boundary_that_was_not_followed_before_its_gap_does_not_count() -> Non
     assert gap_figures([gap_run(10, lambda n: EGO if n >= 10 else (EGO[1],))])["10"]["gaps"] == 0
 
 
-# Ghosts, cuts and jumps
+# Ghosts
 
 
 def test_a_track_that_follows_nothing_in_most_of_its_frames_is_a_ghost() -> None:
@@ -234,6 +235,67 @@ def test_a_track_that_follows_nothing_in_most_of_its_frames_is_a_ghost() -> None
 
 def test_a_duplicate_of_a_followed_boundary_is_no_ghost() -> None:
     assert ghost_figures([run(10, lambda _: (*EGO, Reported(3, 0.6, 2)))])["ghosts"] == 0
+
+
+# Edges of the road: a kerb 0.4 lane widths beside the ego lane
+
+
+KERB = TrueLane(3, 0.9, type="kerb")
+
+
+def with_kerb(_: int) -> tuple[TrueLane, ...]:
+    return (*PAIR, KERB)
+
+
+@pytest.mark.parametrize("place", [0.9, 1.3])
+def test_a_reported_edge_on_an_edge_or_beyond_the_markings_is_ignored(place: float) -> None:
+    answers = run(10, lambda _: (*EGO, Reported(3, place, 2, kind="road_edge")), with_kerb)
+    perfect = run(10, lambda _: EGO, with_kerb)
+    for figures in (identity_figures, ghost_figures, error_figures):
+        assert figures([answers]) == figures([perfect])
+    assert identity_figures([answers])["boundaries"] == 2
+
+
+def test_a_marking_on_an_edge_is_a_ghost_and_an_edge_between_the_markings_is_not() -> None:
+    on_kerb = run(10, lambda _: (*EGO, Reported(3, 0.9, 2)), with_kerb)
+    assert (ghost_figures([on_kerb])["ghosts"], ghost_figures([on_kerb])["ghost_frames"]) == (1, 10)
+    between = run(10, lambda _: (*EGO, Reported(3, 0.0, -2, kind="road_edge")), with_kerb)
+    assert ghost_figures([between])["ghosts"] == 0
+    assert identity_figures([between])["id_false_positives"] == 10
+
+
+def test_a_marking_that_is_reported_as_an_edge_is_still_followed() -> None:
+    figures = error_figures([run(10, lambda _: (EGO[0], Reported(2, 0.5, kind="road_edge")), with_kerb)])
+    assert figures["followed"] == {"ego_boundaries": 20, "followed": 20, "share": 1.0}
+
+
+# Kind, type and color
+
+
+def test_types_and_colors_count_from_two_seconds_of_a_track_on() -> None:
+    """The right track learns its type after 2.4 s; its color is wrong throughout."""
+
+    def answer(n: int) -> tuple[Reported, ...]:
+        learned = "solid" if n >= 60 else "dashed"
+        return (Reported(1, -0.5, type="solid"), Reported(2, 0.5, type=learned, color="yellow"))
+
+    figures = appearance_figures([run(100, answer)])
+    assert figures["kind"] == {
+        "values": 100, "right": 100, "share": 1.0, "tracks": 2, "right_tracks": 2, "track_share": 1.0
+    }  # fmt: skip
+    assert (figures["type"]["values"], figures["type"]["right"], figures["type"]["right_tracks"]) == (100, 90, 2)
+    assert (figures["color"]["right"], figures["color"]["right_tracks"]) == (50, 1)
+    assert appearance_figures([run(100, answer)], after_s=0.0)["type"]["values"] == 200
+
+
+def test_an_edge_and_a_track_without_a_type_are_not_right() -> None:
+    answers = run(60, lambda _: (Reported(1, -0.5), Reported(2, 0.5, kind="road_edge")))
+    figures = appearance_figures([answers])
+    assert (figures["kind"]["share"], figures["type"]["share"], figures["type"]["track_share"]) == (0.5, 0.0, 0.0)
+    assert appearance_figures([])["type"]["share"] is None
+
+
+# Cuts
 
 
 def cut_run(answer: Callable[[int], tuple[Reported, ...]], cut_event: int | None = None) -> ClipRun:
@@ -267,6 +329,9 @@ def test_what_is_left_of_the_old_scene_after_a_cut() -> None:
     assert (figures["old_id_boundaries"], figures["ghost_boundaries"]) == (5, 5)
     assert figures["most_frames_to_ego"] == 3
     assert figures["false_events"] == 1
+
+
+# Jumps
 
 
 def test_a_jump_is_a_step_that_the_truth_does_not_make() -> None:
@@ -440,6 +505,6 @@ def test_a_lane_change_is_one_crossing() -> None:
 def test_figures_are_json_without_nan() -> None:
     groups = (identity_figures, role_figures, event_figures, error_figures, lane_change_figures, gap_figures)
     more = (ghost_figures, cut_figures, jump_figures, uncertainty_figures, motion_figures, meter_figures)
-    for figures in (*groups, *more, calibration_figures, departure_figures):
+    for figures in (*groups, *more, calibration_figures, departure_figures, appearance_figures):
         for runs in ([], [run(3, lambda _: ())]):
             json.dumps(figures(runs), allow_nan=False)
