@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 _LONGEST_JUMP_S: Final = 10.0
 # Capture times rise, also if several frames arrive at once.
 _SHORTEST_STEP_S: Final = 0.001
+# FFmpeg gives a few frames of many cameras no time. That many in a row continue at the pace before them.
+_MOST_UNTIMED: Final = 3
 # A camera's clock is compared with the arrival of its frames over windows of this length. One window may hold a burst
 # of frames that waited in the camera or in the network; several in a row that disagree show that the clock is wrong.
 _WINDOW_S: Final = 2.0
@@ -34,6 +36,8 @@ class CaptureClock:
         self._last_arrival: float | None = None
         self._offset: float | None = None  # from the camera's times to capture times
         self._arrival_offset: float | None = None  # from arrivals to capture times, while these are used
+        self._step = 0.0  # between the latest two times of the camera
+        self._untimed = 0  # frames since the latest time of the camera
         self._window: tuple[float, float] | None = None  # arrival and camera's time at its start
         self._waited = 0.0  # in this window
         self._wrong_windows = 0
@@ -42,6 +46,7 @@ class CaptureClock:
         """Records that the next frame comes from a new connection, whose times start anew."""
         self._has_times = has_times
         self._offset = None
+        self._step = 0.0
         self._window = None
         self._wrong_windows = 0
 
@@ -57,8 +62,13 @@ class CaptureClock:
         self._last_arrival = arrived
         if source is not None and self._has_times:
             self._check_pace(source, requested, arrived)
+        if source is None and self._has_times and self._step and self._untimed < _MOST_UNTIMED:
+            self._untimed += 1
+            self._last += self._step
+            return self._last, "source"
         if source is None or not self._has_times:
             return self._arrival_time(arrived, passed), "arrival"
+        self._untimed = 0
         if self._offset is None:
             # The frame before it may have come without a time, in one burst with this one.
             self._last += max(passed, self._period) if passed else 0.0
@@ -66,7 +76,7 @@ class CaptureClock:
             return self._last, "source"
         step = source + self._offset - self._last
         if 0.0 < step <= passed + _LONGEST_JUMP_S:
-            self._last, self._arrival_offset = self._last + step, None
+            self._last, self._step, self._arrival_offset = self._last + step, step, None
             return self._last, "source"
         self._offset = self._arrival_time(arrived, passed) - source
         return self._last, "arrival"

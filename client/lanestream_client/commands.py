@@ -27,6 +27,8 @@ from lanestream.protocol import (
     parse_camera,
     read_camera_file,
 )
+from lanestream.writing import check_folder, writing
+from lanestream_client.annotated_names import annotated_names
 from lanestream_client.client import LaneClient
 from lanestream_client.departure_clips import departure_clips
 from lanestream_client.failover import RetryPolicy
@@ -144,26 +146,33 @@ def detect(
 ) -> None:
     """Find lanes in images: files, or folders of them. Each image is processed on its own."""
     files = _image_files(paths)
+    names = annotated_names(files)
     camera = _camera(camera_file, camera_height, field_of_view)
+    if annotate is not None:
+        check_folder(annotate)
     report = RunReport()
     with ExitStack() as stack:
         service = stack.enter_context(_open_service(context.obj, **where))
         detect_one = partial(service.detect, horizon=horizon, detector=detector, camera=camera, kinds=kinds or None)
         json_lines = stack.enter_context(json_lines_sink(jsonl))
         advance = stack.enter_context(_progress_bar("images", len(files)))
-        for path in files:
-            result = _detect_file(detect_one, path)
-            advance()
-            if result is None or result.lanes is None:
-                report.add_failure()
-                continue
-            report.write_result(result)
-            if json_lines is None:
-                click.echo(f"{path}: {_describe(result.lanes)}")
-            else:
-                json_lines.write_result(result)
-            if annotate is not None:
-                _write_annotated(result.frame, result.lanes, annotate / f"{path.name}.lanes.jpg")
+        try:
+            for path, name in zip(files, names, strict=True):
+                result = _detect_file(detect_one, path)
+                advance()
+                if result is None or result.lanes is None:
+                    report.add_failure()
+                    continue
+                report.write_result(result)
+                if json_lines is None:
+                    click.echo(f"{path}: {_describe(result.lanes)}")
+                else:
+                    json_lines.write_result(result)
+                if annotate is not None:
+                    _write_annotated(result.frame, result.lanes, annotate / name)
+        except SourceError:  # such as a full disk: what is done is not lost
+            click.echo(f"\n{report.text(service.describe(detector))}", err=_is_stdout(jsonl))
+            raise
         click.echo(f"\n{report.text(service.describe(detector))}", err=_is_stdout(jsonl))
     context.exit(1 if report.failed else 0)
 
@@ -431,10 +440,10 @@ def _write_annotated(frame: SourceFrame, lanes: LanesMessage, target: Path) -> N
         import cv2
 
         from lanestream_client.overlays import draw_lanes
-    drawn = draw_lanes(frame.image(), lanes)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(target), drawn):
-        raise SourceError(f"can't write {target}")
+    # OpenCV itself can't write to a name that is not UTF-8.
+    _, encoded = cv2.imencode(".jpg", draw_lanes(frame.image(), lanes))
+    with writing(target):
+        target.write_bytes(encoded.tobytes())
 
 
 def _is_stdout(path: Path | None) -> bool:

@@ -33,6 +33,7 @@ from lanestream.errors import (
 )
 from lanestream.protocol import SUBPROTOCOL
 from lanestream_client.proxies import Proxy, find_proxy
+from lanestream_client.redaction import redact_url, redact_urls
 
 # How long `ready` may take after a fast handshake: the service may first have to fetch the session from its store, or
 # to close the previous socket of the session.
@@ -85,7 +86,7 @@ class Endpoint:
         Raises SettingsError if the URL, the key or the environment's proxy for the URL is not valid, and
         MissingExtraError if that proxy needs packages that are missing.
         """
-        invalid = SettingsError(f"{_without_login(url)!r} is not a valid service URL", _URL_HINT)
+        invalid = SettingsError(f"{redact_url(url)!r} is not a valid service URL", _URL_HINT)
         try:
             parts = urlsplit(url if "://" in url else f"http://{url}")
             valid = parts.scheme in _HTTP_SCHEMES and bool(parts.hostname) and parts.port != 0
@@ -96,7 +97,7 @@ class Endpoint:
         address = parts.netloc + parts.path.removesuffix("/v1/stream").rstrip("/")
         http = f"{_HTTP_SCHEMES[parts.scheme]}://{address}"
         return cls(
-            base=_without_login(url),
+            base=redact_url(url),
             http=http,
             stream=f"{_WEBSOCKET_SCHEMES[parts.scheme]}://{address}/v1/stream",
             headers=_headers(api_key),
@@ -190,7 +191,7 @@ def refusal_error(status: int, body: bytes | bytearray, endpoint: Endpoint) -> L
 
 def _unreachable_error(endpoint: Endpoint, error: Exception) -> ConnectionFailedError:
     timed_out = isinstance(error, TimeoutError | httpx.TimeoutException)
-    reason = "the connection timed out" if timed_out else re.sub(r"^\[Errno -?\d+\] ", "", str(error))
+    reason = "the connection timed out" if timed_out else redact_urls(re.sub(r"^\[Errno -?\d+\] ", "", str(error)))
     reason = one_line(reason) or type(error).__name__
     failure = f"can't reach the service at {endpoint.base}"
     if endpoint.proxy is not None:
@@ -206,11 +207,6 @@ def _headers(api_key: str | None) -> dict[str, str]:
             "the API key can't be sent", "a key is 1 to 512 ASCII characters without spaces; check for a stray space"
         )
     return {"Authorization": f"Bearer {api_key}"}
-
-
-def _without_login(url: str) -> str:
-    """Returns the URL without the user name and password before an @."""
-    return re.sub(r"^([^/]*//)?[^/]*@", r"\1", url)
 
 
 def _logger_without_debug() -> logging.Logger:

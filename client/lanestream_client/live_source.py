@@ -97,18 +97,19 @@ class LiveSource:
 
     def _frames_of(self, feed: Feed, seq: int) -> Iterator[SourceFrame]:
         """Yields the frames of one connection, numbered from `seq`."""
-        began: float | None = None
+        # Frames may have waited since the camera was opened, all of which come now.
+        began = time.monotonic()
         for number, decoded in enumerate(feed.frames, seq):
             if self._stopped.is_set():
                 return
-            began = decoded.arrived if began is None else began
+            arrived = max(began, decoded.arrived)
             if self._lost_at is not None:
-                self._report_return(decoded.arrived)
+                self._report_return(arrived)
                 self._clock.reconnected(has_times=feed.has_times)
-            if decoded.arrived - began > _STEADY_S:
+            if arrived - began > _STEADY_S:
                 self._attempts = 0
-            self._last_frame = decoded.arrived
-            timestamp, clock = self._clock.time(decoded.time, requested=decoded.requested, arrived=decoded.arrived)
+            self._last_frame = arrived
+            timestamp, clock = self._clock.time(decoded.time, requested=decoded.requested, arrived=arrived)
             yield SourceFrame(number, timestamp, pixels=decoded.pixels, clock=clock, reconnects=self._counts.reconnects)
 
     def _open_again(self, reason: str) -> Feed | None:

@@ -10,13 +10,14 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol, TextIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Protocol, TextIO, cast
 
-from lanestream.errors import ImageError, LostError, SourceError, needs_extra
+from lanestream.errors import ImageError, LostError, needs_extra
 from lanestream.protocol import TimingModel
+from lanestream.writing import check_file, writing
 
 if TYPE_CHECKING:
     import av
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 # The frame times of 24, 25, 29.97, 30, 50 and 60 fps are multiples of it, and it fits into MPEG-4's 16 bits.
 _TIME_BASE: Final = Fraction(1, 60000)
+# The most that is lost of a video that can't be finished, in microseconds.
+_FRAGMENT_US: Final = 1_000_000
 
 
 class ResultSink(Protocol):
@@ -70,7 +73,7 @@ def json_lines_sink(path: Path | None) -> Iterator[JsonLinesSink | None]:
     elif str(path) == "-":
         yield JsonLinesSink(sys.stdout)
     else:
-        with _writing_to(path), path.open("w", encoding="utf-8") as file:
+        with _writing_to(path), path.open("w", encoding="utf-8", buffering=1) as file:
             yield JsonLinesSink(file)
 
 
@@ -114,12 +117,19 @@ class VideoSink:
         self._last_ticks = ticks if ticks > self._last_ticks else self._last_ticks + self._ticks_per_frame
         frame = av.VideoFrame.from_ndarray(_resize_to_fit(image, stream.width, stream.height), format="bgr24")
         frame.pts, frame.time_base = self._last_ticks, _TIME_BASE
-        self._container.mux(stream.encode(frame))
+        self._mux(stream.encode(frame))
 
     def finish(self) -> None:
         """Writes the frames that the encoder still holds."""
         if self._stream is not None:
-            self._container.mux(self._stream.encode(None))
+            self._mux(self._stream.encode(None))
+
+    def _mux(self, packets: list[av.Packet[Any]]) -> None:
+        try:
+            self._container.mux(packets)
+        except OSError:
+            self._stream = None  # there is nothing to finish any more
+            raise
 
 
 @contextmanager
@@ -132,13 +142,32 @@ def video_sink(path: Path | None, fps: float) -> Iterator[VideoSink | None]:
         yield None
         return
     with needs_extra("video"):
-        import av
-    with _writing_to(path), av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        import av  # noqa: F401
+    # FFmpeg itself can't open a file whose name is not UTF-8.
+    with _writing_to(path), path.open("wb") as file, _mp4_container(file) as container:
         sink = VideoSink(container, fps)
         try:
             yield sink
         finally:
             sink.finish()
+
+
+@contextmanager
+def _mp4_container(file: BinaryIO) -> Iterator[av.container.OutputContainer]:
+    import av
+
+    # Written in fragments until it is closed, the file can be played even if the disk gets full or the power fails.
+    options = {"movflags": "+hybrid_fragmented", "frag_duration": str(_FRAGMENT_US)}
+    container = av.open(file, "w", format="mp4", options=options)
+    failed = False
+    try:
+        yield container
+    except OSError:
+        failed = True
+        raise
+    finally:
+        with suppress(av.FFmpegError) if failed else nullcontext():
+            container.close()
 
 
 class RunReport:
@@ -211,13 +240,9 @@ def nearest_rank(ordered: Sequence[float], percent: float) -> float:
 
 @contextmanager
 def _writing_to(path: Path) -> Iterator[None]:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    check_file(path)
+    with writing(path):
         yield
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise SourceError(f"can't write {path}: {(error.strerror or str(error)).lower()}") from None
 
 
 def _add_video_stream(container: av.container.OutputContainer, image: BgrImage) -> av.VideoStream:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,7 +12,8 @@ from click.core import ParameterSource
 from rich.console import Console
 
 from lanestream.engine import SHIPPED_MODEL, load_engine, resolve_regressor
-from lanestream.errors import ModelError, SourceError, needs_extra
+from lanestream.errors import ModelError, needs_extra
+from lanestream.writing import check_file, check_folder, writing
 from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
 from lanestream_exporter.datasets.manifest import DatasetCollection
@@ -84,6 +84,7 @@ def evaluate(
     if context.invoked_subcommand is not None:
         _refuse_options(context)
         return
+    _check_targets(out, json_path)
     evaluation_set = _evaluation_set(data, manifest, format_name, split)
     evaluation = run_evaluation(
         _methods(models, regressor), evaluation_set, lambda stage: click.echo(f"measuring {stage} ...", err=True)
@@ -95,7 +96,7 @@ def evaluate(
     for table in figure_tables(figures):
         console.print(table)
     if out is not None:
-        with needs_extra("train"), _writing(out):
+        with needs_extra("train"), writing(out):
             from lanestream_exporter.evaluation.report import write_report
 
             click.echo(f"report: {write_report(out, evaluation, figures)}")
@@ -153,6 +154,7 @@ def evaluate_tracking(
     With --against or --against-model, two systems get the same frames: this code with --model, and the other one.
     docs/evaluation.md describes each figure.
     """
+    _check_targets(plots, out)
     specs = [SystemSpec(PRESENT, None, model)]
     if against is not None or against_model is not None:
         specs.append(SystemSpec(AGAINST, against, against_model))
@@ -167,7 +169,7 @@ def evaluate_tracking(
     if out is not None:
         _write_json(out, figures)
     if plots is not None and rendered.clips:
-        with needs_extra("train"), _writing(plots):
+        with needs_extra("train"), writing(plots):
             from lanestream_exporter.evaluation.tracking.plots import write_plots
 
             write_plots(plots, figures, runs)
@@ -203,17 +205,16 @@ def _progress(stage: str) -> None:
 
 
 def _write_json(path: Path, figures: Mapping[str, Any]) -> None:
-    with _writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path):
         path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 
 
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise SourceError(f"can't write {path}: {(error.strerror or str(error)).lower()}") from None
+def _check_targets(folder: Path | None, file: Path | None) -> None:
+    """Raises SourceError if one of the targets can't be written: the evaluation takes long."""
+    if folder is not None:
+        check_folder(folder)
+    if file is not None:
+        check_file(file)
 
 
 def _methods(models: Sequence[Path], regressor: Path | None) -> list[Method]:

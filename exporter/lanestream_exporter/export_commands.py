@@ -14,6 +14,7 @@ from rich.table import Table
 from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
 from lanestream.road.crops import PatchGeometry
+from lanestream.writing import check_file
 from lanestream_exporter.alexnet import FULL
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
@@ -92,6 +93,7 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
     """Write CHECKPOINT as the ONNX file OUT for serving, after verifying that both give the same results."""
     if out.is_dir():
         raise ExportError(f"{out} is a folder", "give the path of the file to write")
+    check_file(out)
     foreign = _foreign_network(given["classes"], given["patch"], given["normalization"])
     # An invalid checkpoint must fail now, not after the frames have been prepared.
     network, training = read_network(checkpoint, foreign)

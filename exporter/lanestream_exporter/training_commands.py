@@ -11,6 +11,7 @@ from types import FrameType
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from lanestream.writing import check_file, check_folder
 from lanestream_exporter.datasets.manifest import origin_of
 from lanestream_exporter.samples.patch_files import PatchCache
 from lanestream_exporter.toml_files import CONFIG_FOLDER
@@ -60,6 +61,7 @@ def classifier(
     Renders scenes, cuts patches from them and from real frames, and mixes the two.
     """
     settings = _changed(read_config(config, ClassifierConfig), initial, manifest)
+    check_folder(folder)
     network = starting_network(settings)  # before the patches, so that a bad checkpoint is reported early
     datasets = open_datasets(settings.data, data)
     cache = PatchCache(patches or folder / "patches", settings.network.size, settings.data.regressor_file)
@@ -87,6 +89,7 @@ def regressor(
     Renders scenes, and warps them and real frames as other cameras and roads would show them.
     """
     settings = _changed(read_config(config, RegressorConfig), initial, manifest)
+    check_folder(folder)
     network = starting_regressor(settings)
     datasets = open_datasets(settings.data, data)
     with _bar("rendering") as advance:
@@ -102,6 +105,7 @@ def regressor(
 @click.argument("out", type=click.Path(path_type=Path))
 def checkpoint(source: Path, out: Path) -> None:
     """Write the checkpoint SOURCE of a run to OUT in half precision, as a small file for others to start from."""
+    check_file(out)
     write_half(source, out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 

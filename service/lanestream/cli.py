@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import import_module
 from importlib.metadata import entry_points
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -156,6 +157,9 @@ def main() -> None:
     """Runs the command line. Prints a LanestreamError in one line and exits."""
     # OpenCV's warnings only repeat what the errors say. It reads this variable once, when it is first imported.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    if isinstance(sys.stdout, TextIOWrapper):
+        # What the terminal can't show, such as a file name in another encoding, is escaped, as on standard error.
+        sys.stdout.reconfigure(errors="backslashreplace")
     if os.getpid() == 1:
         signal.signal(signal.SIGTERM, _terminate)
     try:

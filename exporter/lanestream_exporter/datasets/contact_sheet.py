@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lanestream.errors import SourceError
 from lanestream.road.curve import FloatArray
 from lanestream.road.view import Image
+from lanestream.writing import check_file, writing
 from lanestream_exporter.datasets.labels import LabeledFrame
 
 _COLUMNS: Final = 6
@@ -38,11 +39,12 @@ class ContactSheet:
     """Keeps up to 60 of the added frames, evenly spread over all of them."""
 
     def __init__(self, path: Path) -> None:
-        """Starts a sheet to be written to `path`. Raises SourceError if its suffix is not that of an image."""
+        """Starts a sheet to be written to `path`. Raises SourceError if no image can be written there."""
         if path.suffix.lower() not in _SUFFIXES:
             raise SourceError(
                 f"can't write an image to {path}", f"a path that ends in {' or '.join(_SUFFIXES)} is accepted"
             )
+        check_file(path)
         self._path = path
         self._tiles: list[Image] = []
         self._stride = 1
@@ -63,11 +65,8 @@ class ContactSheet:
     def write(self) -> None:
         """Writes the sheet. Raises SourceError if it can't be written."""
         data = cv2.imencode(self._path.suffix.lower(), self._page())[1].tobytes()
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+        with writing(self._path):
             self._path.write_bytes(data)
-        except OSError as error:
-            raise SourceError(f"can't write {self._path}: {(error.strerror or str(error)).lower()}") from None
 
     def _chosen(self) -> list[Image]:
         count = min(_MOST, len(self._tiles))

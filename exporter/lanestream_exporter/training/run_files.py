@@ -14,16 +14,24 @@ from matplotlib.figure import Figure
 
 from lanestream import __version__
 from lanestream.errors import CheckpointError
+from lanestream.writing import writing
 from lanestream_exporter.weight_files import load_state
 
 CurveRow = dict[str, float]
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Writes a checkpoint atomically, so that a run can continue after a crash."""
+    """Writes a checkpoint atomically, so that a run can continue after a crash. Raises SourceError if it can't."""
     unfinished = path.with_suffix(".part")
-    torch.save(state, unfinished)
-    unfinished.replace(path)
+    with writing(path):
+        try:
+            with unfinished.open("wb") as file:
+                torch.save(state, file)
+        except RuntimeError as error:
+            unfinished.unlink()
+            # This is how torch reports that the disk is full.
+            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
+        unfinished.replace(path)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -47,6 +47,13 @@ def test_a_first_frame_without_a_time_is_one_period_before_the_second() -> None:
     assert rounded(found) == [0.0, 0.04, 0.08]
 
 
+def test_single_frames_without_a_time_continue_the_cameras_clock() -> None:
+    frames = [(None if n in {4, 5} else 0.04 * n, 3.0) for n in range(8)]
+    found = times(CaptureClock(0.04, has_times=True), frames)
+    assert rounded(found) == [0.0, 0.04, 0.08, 0.12, 0.16, 0.2, 0.24, 0.28]
+    assert {clock for _, clock in found} == {"source"}
+
+
 @pytest.mark.parametrize("jump", [-0.05, -500.0, 3600.0])
 def test_a_clock_that_is_set_anew_costs_one_frame_its_time(jump: float) -> None:
     frames = [(0.04 * n + (jump if n > 2 else 0.0), 9.0 + 0.04 * n) for n in range(6)]

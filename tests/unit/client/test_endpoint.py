@@ -66,6 +66,10 @@ def test_a_key_appears_only_in_the_header() -> None:
     (endpoint,) = parse_endpoints("http://user:hidden@h", "hidden")
     assert endpoint.headers == {"Authorization": "Bearer hidden"}
     assert endpoint.base == "http://h"
+    for url in ("http://user:hid/den@h", "http://user:hid#den@h", "user:hid?den@h"):
+        with pytest.raises(SettingsError) as caught:
+            Endpoint.parse(url)
+        assert "den" not in str(caught.value)
     for client in (LaneClient, AsyncLaneClient):
         assert "hidden" not in repr(endpoint) + repr(client("http://h", api_key="hidden"))
 

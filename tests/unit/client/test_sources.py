@@ -12,6 +12,7 @@ import cv2
 import fakes
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from lanestream.errors import ImageError, SourceError
@@ -196,13 +197,23 @@ ORIENTATIONS = {
 }
 
 
+def write_mp4(path: Path, images: list[NDArray[np.uint8]], **options: str) -> bytes:
+    """Writes a video and returns its bytes."""
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        assert isinstance(stream, av.VideoStream)
+        stream.height, stream.width = images[0].shape[:2]
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "bgr24")))
+        container.mux(stream.encode(None))
+    return path.read_bytes()
+
+
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 def test_a_video_is_shown_as_its_orientation_says(tmp_path: Path, orientation: tuple[int, int, int, int]) -> None:
     image = np.zeros((48, 64, 3), np.uint8)
     image[:24, :16] = 255  # no two orientations look the same
-    with video_sink(tmp_path / "a.mp4", 25.0) as sink:
-        assert sink is not None
-        sink.write(image, 0.0)
+    write_mp4(tmp_path / "a.mp4", [image])
     data = bytearray((tmp_path / "a.mp4").read_bytes())
     matrix = data.index(b"tkhd") + 4 + 40
     assert data[matrix : matrix + 4] == struct.pack(">i", 1 << 16)
@@ -227,18 +238,12 @@ def test_a_turned_picture_in_a_video_of_jpegs_is_upright(tmp_path: Path) -> None
 
 
 def test_a_file_without_an_index_is_explained(tmp_path: Path) -> None:
-    complete = Path(write_video(tmp_path / "a.mp4", [0.04 * number for number in range(20)], (320, 180))).read_bytes()
-    with av.open(str(tmp_path / "late.mp4"), "w") as container:
-        stream = container.add_stream("mpeg4", rate=25)
-        assert isinstance(stream, av.VideoStream)
-        for _ in range(20):
-            container.mux(stream.encode(av.VideoFrame(640, 480, "yuv420p")))
-        container.mux(stream.encode(None))
-    index_at_the_end = (tmp_path / "late.mp4").read_bytes()
-    start = complete.index(b"moov") - 4
+    images = [np.full((48, 64, 3), number, np.uint8) for number in range(20)]
+    index_in_front = write_mp4(tmp_path / "front.mp4", images, movflags="+faststart")
+    index_at_the_end = write_mp4(tmp_path / "late.mp4", images)
     files = {
         "no-index.mp4": (index_at_the_end[: len(index_at_the_end) // 2], r"has no index \(`moov`\)"),
-        "cut-index.mp4": (complete[: start + 100], r"index \(`moov`\) is cut off"),
+        "cut-index.mp4": (index_in_front[: index_in_front.index(b"moov") + 100], r"index \(`moov`\) is cut off"),
         "cut-index-late.mp4": (
             index_at_the_end[: index_at_the_end.index(b"moov") + 100],
             r"index \(`moov`\) is cut off",
