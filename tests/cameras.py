@@ -175,7 +175,8 @@ class RtspRequest:
 class RtspCamera(Camera):
     """Sends H.264 at `fps`: `counts` frames in the first connection, the second one and so on, then hangs up.
 
-    It stays silent instead if `stalls`. `transports` are those that it accepts; to others it answers `refusal`.
+    It stays silent instead if `stalls`. `transports` are those that it accepts; to others it answers `refusal`. Over
+    those that are `silent` it sends nothing.
     `clock` scales its timestamps: 1 is right, 0 stands still. `duration` is announced in seconds, as of a recording.
     A `login`, `user:password`, is asked for.
     """
@@ -187,6 +188,7 @@ class RtspCamera(Camera):
         *counts: int,
         transports: Sequence[str] = ("tcp", "udp"),
         refusal: str = "461 Unsupported Transport",
+        silent: Sequence[str] = (),
         fps: float = 50.0,
         clock: float = 1.0,
         stalls: bool = False,
@@ -197,6 +199,7 @@ class RtspCamera(Camera):
         self._counts = counts
         self._transports = transports
         self._refusal = refusal
+        self._silent = silent
         self._fps = fps
         self._clock = clock
         self._stalls = stalls
@@ -238,6 +241,8 @@ class RtspCamera(Camera):
         sequence = itertools.count()
         units = access_units()
         start = time.monotonic()
+        if ("tcp" if target is None else "udp") in self._silent:
+            self.wait(fakes.WAIT_S)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagrams:
             for number in range(count):
                 timestamp = _FIRST_TIMESTAMP + round(number / self._fps * self._clock * _RTP_CLOCK)

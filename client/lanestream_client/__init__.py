@@ -4,7 +4,7 @@ from lanestream.protocol import CameraModel, DepartureOptions
 from lanestream_client.async_client import AsyncLaneClient, AsyncLaneStream
 from lanestream_client.client import LaneClient, LaneStream
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
-from lanestream_client.sources import NewestFrames, open_source
+from lanestream_client.sources import LiveReader, open_source
 
 __all__ = [
     "AsyncLaneClient",
@@ -13,7 +13,7 @@ __all__ = [
     "DepartureOptions",
     "LaneClient",
     "LaneStream",
-    "NewestFrames",
+    "LiveReader",
     "SourceFrame",
     "StreamResult",
     "StreamSummary",

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import aclosing, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import httpx
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from lanestream.errors import LanestreamError
+from lanestream.errors import ImageTooLargeError, LanestreamError
 from lanestream.protocol import (
     BoundaryKind,
     CameraModel,
@@ -38,7 +39,10 @@ from lanestream_client.endpoint import (
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
+from lanestream_client.oversize import smaller_image
 from lanestream_client.requests import ServiceInfo
+
+_log: Final = logging.getLogger(__name__)
 
 
 class AsyncLaneClient:
@@ -96,7 +100,17 @@ class AsyncLaneClient:
         those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read.
         """
         data = await asyncio.to_thread(requests.read_image_file, image)
-        query = requests.detect_query(horizon, detector, camera, kinds)
+        query = partial(requests.detect_query, horizon, detector, kinds=kinds)
+        try:
+            return await self._detect(data, query(camera=camera))
+        except ImageTooLargeError:
+            smaller = await asyncio.to_thread(smaller_image, SourceFrame(0, None, data=data))
+            if smaller is None:
+                raise
+        _log.warning("%s", smaller.describe())
+        return smaller.restore(await self._detect(smaller.data, query(camera=smaller.camera(camera))))
+
+    async def _detect(self, data: bytes, query: requests.Query) -> LanesMessage:
         response = await self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
         return requests.parse_lanes(response)
 
@@ -271,9 +285,10 @@ class _StreamTasks:
     async def _read_source(self) -> None:
         try:
             async for frame in self._frames:
+                smaller = await asyncio.to_thread(self._protocol.smaller_image, frame)
                 data = frame.data if frame.data is not None else await asyncio.to_thread(frame.encoded)
                 async with self._changed:
-                    self._protocol.add_frame(frame, data)
+                    self._protocol.add_frame(frame, data, smaller)
                     self._changed.notify_all()
                     await self._changed.wait_for(lambda: self._protocol.wants_frame)
         except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -10,13 +11,13 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import httpx
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from lanestream.errors import LanestreamError
+from lanestream.errors import ImageTooLargeError, LanestreamError
 from lanestream.protocol import (
     BoundaryKind,
     CameraModel,
@@ -39,7 +40,10 @@ from lanestream_client.endpoint import (
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
+from lanestream_client.oversize import smaller_image
 from lanestream_client.requests import ServiceInfo
+
+_log: Final = logging.getLogger(__name__)
 
 
 class LaneClient:
@@ -103,7 +107,17 @@ class LaneClient:
         those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read.
         """
         data = requests.read_image_file(image)
-        query = requests.detect_query(horizon, detector, camera, kinds)
+        query = partial(requests.detect_query, horizon, detector, kinds=kinds)
+        try:
+            return self._detect(data, query(camera=camera))
+        except ImageTooLargeError:
+            smaller = smaller_image(SourceFrame(0, None, data=data))
+            if smaller is None:
+                raise
+        _log.warning("%s", smaller.describe())
+        return smaller.restore(self._detect(smaller.data, query(camera=smaller.camera(camera))))
+
+    def _detect(self, data: bytes, query: requests.Query) -> LanesMessage:
         response = self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
         return requests.parse_lanes(response)
 
@@ -297,10 +311,11 @@ class _StreamThreads:
 
     def _add_frame(self, frame: SourceFrame) -> bool:
         """Adds a frame and waits until the next one is wanted. Returns False if the stream has stopped."""
-        data = frame.encoded()
+        smaller = self._protocol.smaller_image(frame)
+        data = frame.encoded() if smaller is None else smaller.data
         with self._changed:
             if not self._stopped:
-                self._protocol.add_frame(frame, data)
+                self._protocol.add_frame(frame, data, smaller)
                 self._changed.notify_all()
             self._changed.wait_for(lambda: self._stopped or self._protocol.wants_frame)
             return not self._stopped

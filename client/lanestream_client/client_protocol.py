@@ -10,14 +10,22 @@ except those that a resumed session has already processed: only their results ar
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from typing import Literal
+from typing import Final, Literal
 
-from lanestream.errors import DrainingError, ImageTooLargeError, LostError, ProtocolError, error_from_code
+from lanestream.errors import (
+    DrainingError,
+    ImageTooLargeError,
+    LostError,
+    ProtocolError,
+    SettingsError,
+    error_from_code,
+)
 from lanestream.protocol import (
     DrainingMessage,
     EndMessage,
@@ -33,6 +41,9 @@ from lanestream.protocol import (
     parse_server_message,
 )
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
+from lanestream_client.oversize import SmallerImage, fit_frame
+
+_log: Final = logging.getLogger(__name__)
 
 _Unanswered = Literal["dropped", "lost"]
 
@@ -54,6 +65,7 @@ class _PendingFrame:
     data: bytes
     sent: bool = False
     rejection: ErrorMessage | None = None
+    smaller: SmallerImage | None = None
 
     @property
     def waiting(self) -> bool:
@@ -84,6 +96,7 @@ class ClientProtocol:
         self._last_seq = -1
         self._counts: Counter[str] = Counter()
         self._source_ended = False
+        self._reported_size = False
 
     @property
     def wants_frame(self) -> bool:
@@ -118,8 +131,24 @@ class ClientProtocol:
         self._pending = {seq: self._check_size(replace(each, sent=False)) for seq, each in self._pending.items()}
         return results
 
-    def add_frame(self, frame: SourceFrame, data: bytes) -> None:
-        """Adds the next frame of the source, encoded as `data`. Requires that the stream was opened before.
+    def smaller_image(self, frame: SourceFrame) -> SmallerImage | None:
+        """Returns what to send instead of a frame that is larger than the service accepts. Takes time; needs no lock.
+
+        Raises SettingsError if the camera's values are for the original size, but do not say so.
+        """
+        smaller = None if self.ready is None else fit_frame(frame, self.ready.limits)
+        if smaller is not None and smaller.camera(self._start.camera) != self._start.camera:
+            size = "[{}, {}]".format(*smaller.original)
+            raise SettingsError(
+                f"{smaller.describe()}, so the camera needs the size of its images", f'add "image_size": {size} to it'
+            )
+        if smaller is not None and not self._reported_size:
+            self._reported_size = True
+            _log.warning("%s", smaller.describe())
+        return smaller
+
+    def add_frame(self, frame: SourceFrame, data: bytes, smaller: SmallerImage | None = None) -> None:
+        """Adds the next frame of the source, encoded as `data`, or `smaller`. Requires that the stream was opened.
 
         Accepts a frame although `wants_frame` is false now: since the source was asked for it, a lost connection may
         have returned earlier frames to the queue. Raises ProtocolError if its number does not rise.
@@ -127,7 +156,8 @@ class ClientProtocol:
         if frame.seq <= self._last_seq:
             raise ProtocolError(f"frame {frame.seq} came after frame {self._last_seq}", "frame numbers must rise")
         self._last_seq = frame.seq
-        self._pending[frame.seq] = self._check_size(_PendingFrame(frame, data))
+        pending = _PendingFrame(frame, data if smaller is None else smaller.data, smaller=smaller)
+        self._pending[frame.seq] = self._check_size(pending)
 
     def end_source(self) -> None:
         """Records that the source has no more frames."""
@@ -238,8 +268,10 @@ class ClientProtocol:
         if any(pending.waiting for number, pending in self._pending.items() if number < seq):
             raise ProtocolError(f"the service answered frame {seq} before an earlier frame that must be sent again")
         results = self._settle_unanswered(seq)
-        frame = self._pending.pop(seq).frame
+        pending = self._pending.pop(seq)
+        frame = pending.frame
         if isinstance(message, LanesMessage):
+            message = message if pending.smaller is None else pending.smaller.restore(message)
             self._counts["answered"] += 1
             return [*results, StreamResult(frame, lanes=message)]
         self._counts["failed"] += 1

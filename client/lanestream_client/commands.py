@@ -33,10 +33,11 @@ from lanestream_client.client import LaneClient
 from lanestream_client.departure_clips import departure_clips
 from lanestream_client.failover import RetryPolicy
 from lanestream_client.frames import CameraSource, SourceCounts, SourceFrame, StreamResult
+from lanestream_client.image_files import image_files, lacks_jpeg_end, read_image_file
 from lanestream_client.in_process import InProcessClient, InProcessEngine
 from lanestream_client.requests import ServiceInfo
 from lanestream_client.sinks import RunReport, json_lines_sink, video_sink
-from lanestream_client.sources import RECONNECT_CAMERA_S, NewestFrames, image_files, open_source
+from lanestream_client.sources import RECONNECT_CAMERA_S, LiveReader, open_source
 from lanestream_client.video_sources import RtspTransport
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 # the default. Raises click.BadParameter if the provider is unknown.
 LoadEngine = Callable[[Path | None, str | None, Path | None], InProcessEngine]
 _Command = Callable[..., None]
+_NO_END: Final = "the JPEG has no end marker; if it was cut short, its last pixels are missing"
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 
 
@@ -310,22 +312,23 @@ class _StreamRun:
         self._info: ServiceInfo | None = None
         self._reconnects = 0
         self._warned = 0
+        self._warned_of_end = False
 
     def process(self, start: Callable[..., ResultStream], source: CameraSource, mode: Mode) -> bool:
         """Streams the source. Returns whether the user interrupted it, which is how a live stream ends."""
         with ExitStack() as stack:
             advance = stack.enter_context(_progress_bar("frames", source.length))
-            newest = None
-            if source.live and mode == "latest":
-                newest = stack.enter_context(NewestFrames(source.frames))
-            results = start(newest or source.frames)
+            reader = None
+            if source.live:
+                reader = stack.enter_context(LiveReader(source.frames, skip=mode == "latest"))
+            results = start(reader or source.frames)
             interrupted = False
             try:
                 with closing(iter(results)) as iterator, ExitStack() as stops:
                     # A thread of the stream may wait for a camera that is lost.
                     stops.callback(source.stop)
-                    if newest is not None:
-                        stops.callback(newest.stop)
+                    if reader is not None:
+                        stops.callback(reader.stop)
                     for result in iterator:
                         self._check_connection(results)
                         self._report_warnings(results)
@@ -337,7 +340,7 @@ class _StreamRun:
                 interrupted = True
             finally:
                 dropped = results.summary.dropped if results.summary else 0
-                self._dropped = dropped + (newest.skipped if newest else 0)
+                self._dropped = dropped + (reader.skipped if reader else 0)
         return interrupted
 
     def report_text(self, service: LaneService, detector: DetectorName | None, source: SourceCounts) -> str:
@@ -346,6 +349,9 @@ class _StreamRun:
 
     def _write(self, result: StreamResult) -> None:
         self.report.write_result(result)
+        if not self._warned_of_end and lacks_jpeg_end(result.frame.data or b""):
+            self._warned_of_end = True
+            click.echo(f"warning: frame {result.frame.seq}: {_NO_END}", err=True)
         if result.error is not None:
             click.echo(f"frame {result.frame.seq}: {result.error.message}", err=True)
         for sink in self._sinks:
@@ -411,20 +417,27 @@ def _camera(file: Path | None, height: float | None, field_of_view: float | None
 
 
 def _image_files(paths: Sequence[Path]) -> list[Path]:
-    return [file for path in paths for file in (image_files(path) if path.is_dir() else [path])]
+    return [
+        file
+        for path in paths
+        for file in (image_files(path, partial(click.echo, err=True)) if path.is_dir() else [path])
+    ]
 
 
 def _detect_file(detect_one: Callable[[bytes], LanesMessage], path: Path) -> StreamResult | None:
     """Returns the result of an image file. If the file or the image is bad, prints why and returns None."""
     try:
-        data = path.read_bytes()
+        data = read_image_file(path)
+    except SourceError as error:
+        click.echo(f"error: {error}", err=True)
+        return None
+    try:
         lanes = detect_one(data)
     except ImageError as error:
         click.echo(f"error: {path}: {error}", err=True)
         return None
-    except OSError as error:
-        click.echo(f"error: can't read {path}: {(error.strerror or str(error)).lower()}", err=True)
-        return None
+    if lacks_jpeg_end(data):
+        click.echo(f"warning: {path}: {_NO_END}", err=True)
     return StreamResult(SourceFrame(0, None, data=data, name=str(path)), lanes=lanes)
 
 

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Final
 
+from lanestream.errors import SourceError
 from lanestream.protocol import DepartureEventModel
-from lanestream.writing import check_folder
 from lanestream_client.sinks import json_lines_sink, video_sink
 
 if TYPE_CHECKING:
@@ -86,12 +87,18 @@ class DepartureClips:
 def departure_clips(folder: Path, seconds: float | None, fps: float) -> Iterator[DepartureClips | None]:
     """Opens a sink for clips in `folder`; `fps` is the frame rate of frames without a time. None if `seconds` is None.
 
-    Creates the folder. Raises SourceError if the folder or a clip can't be written.
+    The first clip creates the folder. Raises SourceError if the folder or a clip can't be written.
     """
     if seconds is None:
         yield None
         return
     # The first departure may come hours later.
-    check_folder(folder)
+    try:
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        with TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise SourceError(f"can't write to the folder {folder}: {reason}", "give another --departures-folder") from None
     with ExitStack() as files:
         yield DepartureClips(folder, seconds, fps, files)

@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 from pydantic import ValidationError
 
-from lanestream.errors import NoDetectorError, ProtocolError, SourceError
+from lanestream.errors import NoDetectorError, ProtocolError
 from lanestream.protocol import (
     BoundaryKind,
     CameraModel,
@@ -24,7 +24,10 @@ from lanestream.protocol import (
     StartMessage,
     parse_client_message,
 )
+from lanestream_client import image_files
 from lanestream_client.endpoint import Endpoint, refusal_error
+
+Query = dict[str, float | str | list[str]]
 
 
 @dataclass(frozen=True)
@@ -40,12 +43,7 @@ def read_image_file(image: bytes | str | Path) -> bytes:
 
     Raises SourceError if the file can't be read.
     """
-    if isinstance(image, bytes):
-        return image
-    try:
-        return Path(image).read_bytes()
-    except OSError as error:
-        raise SourceError(f"can't read {image}: {(error.strerror or str(error)).lower()}") from None
+    return image if isinstance(image, bytes) else image_files.read_image_file(Path(image))
 
 
 def detect_query(
@@ -53,7 +51,7 @@ def detect_query(
     detector: DetectorName | None,
     camera: CameraModel | None,
     kinds: Sequence[BoundaryKind] | None,
-) -> dict[str, float | str | list[str]]:
+) -> Query:
     """Returns the query parameters of `/v1/detect`. Raises ProtocolError if `kinds` is empty."""
     if kinds is not None and not kinds:
         raise ProtocolError("no kind of boundaries is to be reported", "give marking, road_edge or both")

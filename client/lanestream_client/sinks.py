@@ -157,7 +157,7 @@ def _mp4_container(file: BinaryIO) -> Iterator[av.container.OutputContainer]:
     import av
 
     # Written in fragments until it is closed, the file can be played even if the disk gets full or the power fails.
-    options = {"movflags": "+hybrid_fragmented", "frag_duration": str(_FRAGMENT_US)}
+    options = {"movflags": "+hybrid_fragmented+negative_cts_offsets", "frag_duration": str(_FRAGMENT_US)}
     container = av.open(file, "w", format="mp4", options=options)
     failed = False
     try:

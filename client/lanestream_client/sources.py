@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -12,29 +11,29 @@ from typing import TYPE_CHECKING, Final, Self
 
 from lanestream.errors import SourceError
 from lanestream_client.frames import CameraSource, SourceFrame
+from lanestream_client.image_files import IMAGE_SUFFIXES, image_files, read_image_file
 from lanestream_client.video_sources import SOURCE_HINT, open_camera, open_network_stream, open_video_file
 
 if TYPE_CHECKING:
     from lanestream_client.video_sources import RtspTransport
 
-IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp")
 # How long a live camera is opened again by default. Many need most of a minute to start.
 RECONNECT_CAMERA_S: Final = 60.0
-# How long to wait for the thread of a camera that does not answer. It ends by itself when its wait for data ends.
-_JOIN_S: Final = 1.0
 
 _log: Final = logging.getLogger(__name__)
 
 
-class NewestFrames:
-    """Reads a live source in a thread, and yields only the newest frame that was not yielded before.
+class LiveReader:
+    """Reads a live source in a thread, and by default yields only the newest frame that was not yielded before.
 
-    A slow reader then skips frames instead of falling behind. `skipped` counts them. An exception of `frames` is raised
-    after the last frame.
+    A slow caller then skips frames instead of falling behind; `skipped` counts them. With `skip=False` the thread waits
+    until each frame was taken. The caller can be interrupted while it waits, which FFmpeg does not allow. An exception
+    of `frames` is raised after the last frame.
     """
 
-    def __init__(self, frames: Iterator[SourceFrame]) -> None:
+    def __init__(self, frames: Iterator[SourceFrame], *, skip: bool = True) -> None:
         self._frames = frames
+        self._skip = skip
         self._changed = threading.Condition()
         self._newest: SourceFrame | None = None
         self._error: Exception | None = None
@@ -49,7 +48,8 @@ class NewestFrames:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
-        self._thread.join(_JOIN_S)
+        # A camera that is silent keeps the thread until its wait for data ends. FFmpeg can't be interrupted before.
+        self._thread.join()
 
     def stop(self) -> None:
         """Ends the iteration, also while another thread waits for a frame."""
@@ -67,6 +67,7 @@ class NewestFrames:
                 raise StopIteration
             frame, self._newest = self._newest, None
             if frame is not None:
+                self._changed.notify_all()
                 return frame
             if self._error is not None:
                 raise self._error
@@ -76,17 +77,19 @@ class NewestFrames:
         try:
             for frame in self._frames:
                 with self._changed:
+                    if not self._skip:
+                        self._changed.wait_for(lambda: self._newest is None or self._stopped)
                     if self._stopped:
                         return
                     self.skipped += self._newest is not None
                     self._newest = frame
-                    self._changed.notify()
+                    self._changed.notify_all()
         except Exception as error:
             self._error = error
         finally:
             with self._changed:
                 self._ended = True
-                self._changed.notify()
+                self._changed.notify_all()
 
 
 def open_source(
@@ -112,7 +115,7 @@ def open_source(
         return open_network_stream(spec, reconnect_s, rtsp_transport, notify)
     path = Path(spec)
     if path.is_dir():
-        return _images(spec, image_files(path), fps)
+        return _images(spec, image_files(path, notify), fps)
     if not path.exists():
         raise SourceError(f"no such file or folder: {spec}", SOURCE_HINT)
     if path.is_char_device():
@@ -120,25 +123,10 @@ def open_source(
     return _images(spec, [path], fps) if path.suffix.lower() in IMAGE_SUFFIXES else open_video_file(spec)
 
 
-def image_files(folder: Path) -> list[Path]:
-    """Returns the image files in `folder` in natural order, 2.jpg before 10.jpg. Raises SourceError if it has none."""
-    files = sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key)
-    if not files:
-        raise SourceError(f"no images in the folder {folder}", f"accepted file types: {', '.join(IMAGE_SUFFIXES)}")
-    return files
-
-
-def _natural_key(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name.lower())]
-
-
 @contextmanager
 def _images(name: str, files: list[Path], fps: float) -> Iterator[CameraSource]:
     def frames() -> Iterator[SourceFrame]:
         for seq, path in enumerate(files):
-            try:
-                yield SourceFrame(seq, seq / fps, data=path.read_bytes(), name=path.name, clock="frame_rate")
-            except OSError as error:
-                raise SourceError(f"can't read {path}: {(error.strerror or str(error)).lower()}") from None
+            yield SourceFrame(seq, seq / fps, data=read_image_file(path), name=path.name, clock="frame_rate")
 
     yield CameraSource(name, frames(), live=False, fps=fps, length=len(files))

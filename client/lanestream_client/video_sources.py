@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from itertools import chain
 from pathlib import Path
@@ -59,7 +60,9 @@ def open_network_stream(
     name = redact_url(url)
     counts = SourceCounts()
     try:
-        opened = _open_network(url, transport, counts)
+        # In a thread, because PyAV loses a Ctrl-C that comes while the main thread waits for data.
+        with ThreadPoolExecutor(1) as thread:
+            opened = thread.submit(_open_network, url, transport, counts).result()
     except VideoError as error:
         raise SourceError(f"can't open {name}: {error}", SOURCE_HINT) from None
     if not isinstance(opened, Feed):

@@ -18,10 +18,7 @@ _PROBE: Final = bytes(1 << 16)
 def check_folder(folder: Path) -> None:
     """Creates the folder if it is missing. Raises SourceError if nothing can be written to it."""
     with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder) as file:
-            file.write(_PROBE)
-            file.flush()
+        _probe(folder)
 
 
 def check_file(path: Path) -> None:
@@ -32,7 +29,15 @@ def check_file(path: Path) -> None:
         return
     if path.exists() and not os.access(path, os.W_OK):
         raise SourceError(f"can't write {path}: permission denied")
-    check_folder(path.parent)
+    with writing(path):
+        _probe(path.parent)
+
+
+def _probe(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryFile(dir=folder) as file:
+        file.write(_PROBE)
+        file.flush()
 
 
 @contextmanager

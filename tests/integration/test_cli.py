@@ -422,7 +422,8 @@ def test_an_interrupted_stream_prints_its_report(tmp_path: Path, real_engine: En
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
     ) as process:
         assert process.stdout is not None
-        assert process.stdout.readline().startswith('{"type": "lanes"')
+        for _ in range(10):  # each is written before its frame is drawn
+            assert process.stdout.readline().startswith('{"type": "lanes"')
         process.send_signal(signal.SIGINT)
         output, errors = process.communicate(timeout=fakes.WAIT_S)
     assert process.returncode == 130

@@ -335,9 +335,8 @@ def test_the_examples_of_the_client_page_work(
 ) -> None:
     (tmp_path / "road.jpg").write_bytes(fakes.image_file())
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert len(blocks) == 2
-    for code in blocks:
+    blocking, asynchronous, _ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    for code in (blocking, asynchronous):
         exec(code.replace("http://127.0.0.1:8000", url), {})  # noqa: S102
         lines = capsys.readouterr().out.splitlines()
         assert [line.split(" ", 2)[0] for line in lines if line[0].isdigit()] == [str(seq) for seq in range(25)]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import re
+import signal
+import socket
 import sys
 import threading
 import time
@@ -24,6 +27,7 @@ from lanestream_client.sinks import video_sink
 
 Run = Callable[..., tuple[int, str, str]]
 
+PAGE = Path(__file__).parents[2] / "docs" / "client.md"
 JPEGS = [part(jpeg(number)) for number in range(12)]
 
 
@@ -128,6 +132,18 @@ def test_a_stream_is_stopped_while_its_camera_is_lost() -> None:
         lost.join()
 
 
+@pytest.mark.parametrize("mode", ["all", "latest"])
+def test_a_silent_camera_can_be_interrupted(run: Run, mode: str) -> None:
+    with MjpegCamera(JPEGS, stalls=True) as camera:
+        # PyAV loses an interrupt that comes while the main thread waits for data.
+        timer = threading.Timer(3.0, signal.raise_signal, [signal.SIGINT])
+        timer.start()
+        code, output, _ = run(camera.url, "--mode", mode)
+        timer.join()
+    assert code == 130
+    assert "12 frames: " in output
+
+
 def test_a_service_keeps_the_session_over_an_outage(url: str) -> None:
     with (
         MjpegCamera(JPEGS, JPEGS) as camera,
@@ -179,6 +195,13 @@ def test_a_camera_that_only_knows_udp_is_read_over_udp(refusal: str) -> None:
     assert camera.setups == ["tcp", "udp"]
 
 
+def test_a_camera_that_agrees_to_tcp_and_sends_nothing_is_read_over_udp() -> None:
+    with RtspCamera(12, silent=["tcp"]) as camera:
+        frames, _, _ = read(camera)
+    assert len(frames) >= 11
+    assert camera.setups == ["tcp", "udp"]
+
+
 def test_the_transport_can_be_chosen(run: Run) -> None:
     for transport in ("tcp", "udp"):
         with RtspCamera(12) as camera:
@@ -199,6 +222,15 @@ def test_a_login_works_and_is_never_shown(run: Run, caplog: pytest.LogCaptureFix
         assert code == (3 if accepted == password else 1)
         assert password not in output + errors + caplog.text
         assert f"127.0.0.1:{camera.port}/live" in errors
+
+
+def test_the_example_of_a_camera_works(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (code,) = re.findall(r"```python\n([^`]*open_source.*?)```", PAGE.read_text(), re.DOTALL)
+    with RtspCamera(12) as camera:
+        code = code.replace("http://127.0.0.1:8000", url).replace("10.0.0.7/stream1", f"127.0.0.1:{camera.port}/live")
+        with pytest.raises(CameraLostError, match="closed the stream"):
+            exec(code.replace("reconnect_s=60.0", "reconnect_s=0.0"), {})  # noqa: S102
+    assert " source left=" in capsys.readouterr().out
 
 
 def test_a_login_in_the_parameters_is_never_shown(run: Run) -> None:
@@ -225,6 +257,34 @@ def test_a_recording_whose_server_dies_is_an_error() -> None:
     with RtspCamera(25, fps=25.0, duration=10.0) as camera, open_source(camera.url) as source:
         assert not source.live
         with pytest.raises(SourceError, match=r"ended after (0|1)\.\d of 10\.0 s"):
+            list(source.frames)
+
+
+class BreakingServer(Camera):
+    """Serves the first half of a file of twice that size."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__()
+        self._data = data
+
+    def serve(self, end: socket.socket, number: int) -> None:
+        end.recv(65536)
+        end.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: video/mp4\r\nContent-Length: %d\r\n\r\n" % len(self._data))
+        end.sendall(self._data[: len(self._data) // 2])
+
+
+def test_a_download_that_breaks_off_is_an_error(tmp_path: Path) -> None:
+    images = np.random.default_rng(1).integers(0, 255, (100, 120, 160, 3), np.uint8)
+    with av.open(str(tmp_path / "a.mp4"), "w", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height = 160, 120
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "bgr24")))
+        container.mux(stream.encode(None))
+    with BreakingServer((tmp_path / "a.mp4").read_bytes()) as server, open_source(server.url) as source:
+        assert not source.live
+        with pytest.raises(SourceError, match=r"ended after [12]\.\d of 4\.0 s|failed after \d+ frames"):
             list(source.frames)
 
 

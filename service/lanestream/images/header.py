@@ -49,6 +49,16 @@ _DEFLATE_RATIO: Final = 1032
 _MAX_EXCESS_BYTES: Final = 1 << 26
 _INFLATE_STEP: Final = 1 << 18
 
+# Formats that are not accepted, by their first bytes.
+_OTHER_FORMATS: Final = {
+    "HEIC": re.compile(rb"....ftyp(hei[cfmsx]|hev[cmsx]|mif1|msf1)", re.DOTALL),
+    "AVIF": re.compile(rb"....ftypavi[fs]", re.DOTALL),
+    "TIFF": re.compile(rb"II\*\0|MM\0\*"),
+    "BMP": re.compile(rb"BM"),
+    "GIF": re.compile(rb"GIF8[79]a"),
+    "PDF": re.compile(rb"%PDF-"),
+    "SVG": re.compile(rb"\s*<(\?xml.{0,200}<)?svg", re.DOTALL),
+}
 _BINARY: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 
@@ -108,6 +118,9 @@ def corrupt_image(kind: str) -> ImageError:
 def _describe(data: bytes) -> str:
     if not data:
         return "it is empty"
+    for kind, magic in _OTHER_FORMATS.items():
+        if magic.match(data):
+            return f"its format is {kind}"
     return "its format is unknown" if _BINARY.search(data[:64]) else "it looks like text"
 
 

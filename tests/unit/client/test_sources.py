@@ -15,11 +15,12 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from lanestream.errors import ImageError, SourceError
+from lanestream.errors import CameraLostError, ImageError, SourceError
 from lanestream.images.header import read_header
+from lanestream_client import live_source
 from lanestream_client.frames import SourceFrame
 from lanestream_client.sinks import video_sink
-from lanestream_client.sources import NewestFrames, open_source
+from lanestream_client.sources import LiveReader, open_source
 
 
 def write_video(path: Path, times: list[float], size: tuple[int, int] = (64, 48)) -> str:
@@ -73,6 +74,51 @@ def test_an_invalid_source_is_reported(tmp_path: Path) -> None:
             pass
 
 
+class UnpluggedCapture:
+    """A camera that delivers two frames each time it is opened, which fails the second time and after the fourth."""
+
+    opened = 0
+
+    def __init__(self, device: int | str) -> None:
+        assert device == 4
+        type(self).opened += 1
+        self._frames = 2
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return self.opened in {1, 3, 4}
+
+    def get(self, _: int) -> float:
+        return 0.0
+
+    def read(self) -> tuple[bool, NDArray[np.uint8]]:
+        self._frames -= 1
+        return self._frames >= 0, np.zeros((48, 64, 3), np.uint8)
+
+    def release(self) -> None:
+        pass
+
+
+def test_an_unplugged_camera_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", UnpluggedCapture)
+    monkeypatch.setattr(live_source, "_FIRST_PAUSE_S", 0.01)
+    notices: list[str] = []
+    frames = []
+    with open_source("4", reconnect_s=0.5, notify=notices.append) as source:
+        assert source.live
+        with pytest.raises(
+            CameraLostError, match=r"camera 4 stopped delivering frames and did not come back within 0\.5"
+        ):
+            frames.extend(source.frames)
+    assert [(frame.seq, frame.reconnects, frame.clock) for frame in frames] == [
+        (seq, seq // 2, "arrival") for seq in range(6)
+    ]
+    assert source.counts.reconnects == 2
+    assert [notice.split(";")[0].split(" after")[0] for notice in notices] == [
+        "camera 4 stopped delivering frames",
+        "camera 4 is back",
+    ] * 2 + ["camera 4 stopped delivering frames"]
+
+
 def test_a_missing_camera_is_reported() -> None:
     with pytest.raises(SourceError, match="camera 97 was not found"), open_source("97"):
         pass
@@ -90,8 +136,9 @@ def test_a_file_with_sound_only_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_truncated_video_is_read_up_to_its_end(tmp_path: Path) -> None:
-    complete = Path(write_video(tmp_path / "a.mp4", [0.04 * number for number in range(40)], (320, 180)))
-    (tmp_path / "cut.mp4").write_bytes(complete.read_bytes()[: complete.stat().st_size * 2 // 3])
+    images = [np.full((180, 320, 3), 6 * number, np.uint8) for number in range(40)]
+    complete = write_mp4(tmp_path / "a.mp4", images, movflags="+faststart")
+    (tmp_path / "cut.mp4").write_bytes(complete[: len(complete) * 2 // 3])
     with open_source(str(tmp_path / "cut.mp4")) as source:
         assert 0 < len(list(source.frames)) < 40
 
@@ -114,7 +161,7 @@ def test_a_live_source_yields_its_newest_frame() -> None:
         assert proceed[1].wait(fakes.WAIT_S)
         raise SourceError("the cable is unplugged")
 
-    with NewestFrames(camera()) as newest:
+    with LiveReader(camera()) as newest:
         assert next(newest).seq == 0
         proceed[0].set()
         assert delivered.wait(fakes.WAIT_S)
@@ -125,8 +172,15 @@ def test_a_live_source_yields_its_newest_frame() -> None:
             next(newest)
 
 
+def test_a_live_source_can_be_read_without_skipping() -> None:
+    frames = [SourceFrame(seq, 0.0) for seq in range(50)]
+    with LiveReader(iter(frames), skip=False) as reader:
+        assert [frame.seq for frame in reader] == list(range(50))
+    assert reader.skipped == 0
+
+
 def test_iteration_ends_with_a_live_source() -> None:
-    with NewestFrames(iter([SourceFrame(0, 0.0)])) as newest:
+    with LiveReader(iter([SourceFrame(0, 0.0)])) as newest:
         assert [frame.seq for frame in newest] == [0]
 
 
@@ -272,7 +326,7 @@ def test_a_waiting_reader_of_a_live_source_can_be_stopped() -> None:
         silence.wait(fakes.WAIT_S)
         yield SourceFrame(0, 0.0)
 
-    with NewestFrames(camera()) as newest:
+    with LiveReader(camera()) as newest:
         timer = threading.Timer(0.1, newest.stop)
         timer.start()
         assert list(newest) == []

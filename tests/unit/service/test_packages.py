@@ -86,8 +86,10 @@ def test_faults_of_our_own_modules_are_not_hidden(name: str) -> None:
         getattr("text", name)
 
 
-@pytest.mark.parametrize("module", ["cv2", "onnxruntime"])
-@pytest.mark.parametrize("command", [["detect", "x.jpg"], ["doctor"], ["serve", "--port", "0"]])
+@pytest.mark.parametrize(
+    ("module", "command"),
+    [("cv2", ["detect", "x.jpg"]), ("cv2", ["doctor"]), ("onnxruntime", ["serve", "--port", "0"])],
+)
 def test_commands_say_what_cannot_be_used(module: str, command: list[str], tmp_path: Path) -> None:
     package = tmp_path / "packages" / module
     package.mkdir(parents=True)
