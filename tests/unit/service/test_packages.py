@@ -97,8 +97,8 @@ def test_commands_say_what_cannot_be_used(module: str, command: list[str], tmp_p
     (tmp_path / "x.jpg").touch()
     done = subprocess.run(
         [sys.executable, "-m", "lanestream.cli", *command],
-        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(package.parent)}, capture_output=True, text=True, check=False,
-        timeout=60,
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(package.parent)}, capture_output=True, text=True,
+        check=False, timeout=60,
     )  # fmt: skip
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert (done.returncode, len(lines), "Traceback" in done.stderr) == (1, 1, False), done.stderr
