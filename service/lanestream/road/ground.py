@@ -23,6 +23,8 @@ _LEAST_RATIO: Final = 2.5
 _NEAREST_ROWS: Final = 2.0
 # The step of numerical derivatives by the columns, in pixels.
 _COLUMN_STEP: Final = 0.5
+# The determinant of the normal equations of a parabola: above 1e-3 for usual cameras, and up to this by rounding alone.
+_LEAST_DETERMINANT: Final = 1e-9
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,10 @@ class RoadPlane:
         powers = np.ones((len(rows), 3, rows.shape[1]))
         powers[:, 1] = x / unit
         powers[:, 0] = powers[:, 1] ** 2
-        solve = np.linalg.solve(powers @ powers.transpose(0, 2, 1), powers)
+        normal = powers @ powers.transpose(0, 2, 1)
+        # A lens that shows all points at one distance determines no parabola.
+        normal[np.linalg.det(normal) < _LEAST_DETERMINANT] = np.nan
+        solve = np.linalg.solve(normal, powers)
         solve[:, 0] /= unit**2
         solve[:, 1] /= unit
         coefficients = (solve @ y[:, :, None])[:, :, 0]

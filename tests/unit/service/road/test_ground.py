@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanestream.messages import ProcessedFrame, lanes_message
-from lanestream.road.camera import Camera, Distortion, camera_from_vehicle
+from lanestream.road.camera import Camera, Distortion, Lens, camera_from_vehicle
 from lanestream.road.curve import Curve, FloatArray, curve_basis
 from lanestream.road.ground import with_meters
 from lanestream.road.results import EgoLane, EgoMeters, Estimate, FrameResult, LaneBoundary, RoadEstimate
@@ -213,6 +213,22 @@ def test_a_lens_that_folds_the_image_gives_no_meters() -> None:
     result = in_meters(result_of(good, {1: (0.0, 0.0, 1.75), 2: (0.0, 0.0, -1.75)}), camera)
     grounds = np.array([lane.ground or (0.0, 0.0, 0.0) for lane in result.lanes])
     assert np.isfinite(grounds).all()
+
+
+class FoldedLens(Lens):
+    """A lens whose distortion maps all pixels to one ray."""
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        return np.full(pixels.shape, 0.1)
+
+
+def test_a_lens_that_shows_all_points_at_one_distance_gives_no_meters() -> None:
+    camera = Camera(1.4, 62.0)
+    result = result_of(camera, {1: (0.0, 0.0, 1.75), 2: (0.0, 0.0, -1.75)})
+    lens = FoldedLens(**vars(camera.lens(SIZE, SIZE)))
+    found = with_meters(result, camera, lens, Estimate(0.0, 0.0), SIZE[1] - 1.0)
+    assert [lane.ground for lane in found.lanes] == [None, None]
+    assert found.ego.meters is None
 
 
 angles = st.floats(-30.0, 30.0)
