@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -42,6 +42,9 @@ _TRACKED: Final = 0.16
 # closer to a marking.
 _CLOSEST: Final = 0.8
 _CLOSEST_EDGE: Final = 0.2
+# The road ends at its edge: what lies beyond one has this share of its odds. Usually it is the far side of a sidewalk, a
+# fence or a row of parked vehicles.
+_BEYOND_EDGE: Final = 0.03
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,8 @@ class CandidateDetector:
             for i, p in enumerate(probability[accepted[chosen]].tolist())
             if visible.visible[i]
         ]
-        boundaries = _separated(sorted(detections, key=lambda detection: -detection.probability), fits.view)
+        separated = _separated(sorted(detections, key=lambda detection: -detection.probability), fits.view)
+        boundaries = _on_road(separated, fits.view, self.threshold)
         fit_s = time.perf_counter() - started
         return Detections(boundaries, fits.view, proposals.horizon_weight, prior_horizon, fit_s)
 
@@ -150,6 +154,27 @@ def _separated(detections: list[Detection], view: RoadView) -> tuple[Detection, 
     closest = np.where(is_edge[:, None] == is_edge, _CLOSEST, _CLOSEST_EDGE)
     kept = non_maximum_suppression(~on_one_side | (np.abs(gaps).min(axis=2) <= closest))
     return tuple(sorted((detections[i] for i in kept.tolist()), key=lambda each: float(each.curve.x(view.bottom))))
+
+
+def _on_road(detections: tuple[Detection, ...], view: RoadView, threshold: float) -> tuple[Detection, ...]:
+    """Returns the detections that remain probable although edges of the road lie between them and the camera.
+
+    `detections` are sorted from left to right.
+    """
+    is_left = [float(each.curve.x(view.bottom)) < view.middle for each in detections]
+    kept: list[Detection] = []
+    for side in (
+        [each for each, left in zip(detections, is_left, strict=True) if left][::-1],
+        [each for each, left in zip(detections, is_left, strict=True) if not left],
+    ):
+        reached = 1.0
+        for each in side:
+            factor = reached + (1.0 - reached) * _BEYOND_EDGE
+            p = each.probability * factor / (1.0 - each.probability + each.probability * factor)
+            if p >= threshold:
+                kept.append(replace(each, probability=p))
+            reached *= 1.0 - p * each.appearance.road_edge
+    return tuple(sorted(kept, key=lambda each: float(each.curve.x(view.bottom))))
 
 
 def _gaps(curves: Curves, view: RoadView) -> FloatArray:
