@@ -151,8 +151,8 @@ def test_corrupt_files_are_reported_as_corrupt(data: bytes) -> None:
         (b"hello\n", "it looks like text"),
         ("größe".encode(), "it looks like text"),
         (b'{"type": "frame"}', "it looks like text"),
-        (b"\x00\x00\x00\x1cftypheic", "its format is unknown"),
-        (b"GIF89a\x01\x00\x01\x00", "its format is unknown"),
+        (b"\x00\x00\x00\x1cftypheic", "its format is HEIC"),
+        (b"GIF89a\x01\x00\x01\x00", "its format is GIF"),
         (b"RIFF\x00\x00\x00\x00WAVE", "its format is unknown"),
     ],
 )
