@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Protocol, TextIO, cast
+from typing import TYPE_CHECKING, Any, Final, Protocol, TextIO, cast
 
 from lanestream.errors import ImageError, LostError, needs_extra
 from lanestream.protocol import TimingModel
@@ -143,8 +143,7 @@ def video_sink(path: Path | None, fps: float) -> Iterator[VideoSink | None]:
         return
     with needs_extra("video"):
         import av  # noqa: F401
-    # FFmpeg itself can't open a file whose name is not UTF-8.
-    with _writing_to(path), path.open("wb") as file, _mp4_container(file) as container:
+    with _writing_to(path), _mp4_container(path) as container:
         sink = VideoSink(container, fps)
         try:
             yield sink
@@ -153,12 +152,13 @@ def video_sink(path: Path | None, fps: float) -> Iterator[VideoSink | None]:
 
 
 @contextmanager
-def _mp4_container(file: BinaryIO) -> Iterator[av.container.OutputContainer]:
+def _mp4_container(path: Path) -> Iterator[av.container.OutputContainer]:
     import av
 
+    # FFmpeg opens the file itself: PyAV loses a Ctrl-C that Python notices while it writes to a file of Python's.
     # Written in fragments until it is closed, the file can be played even if the disk gets full or the power fails.
     options = {"movflags": "+hybrid_fragmented+negative_cts_offsets", "frag_duration": str(_FRAGMENT_US)}
-    container = av.open(file, "w", format="mp4", options=options)
+    container = av.open(f"file:{path}", "w", format="mp4", options=options)
     failed = False
     try:
         yield container

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final, cast
 
 from lanestream.errors import needs_extra
-from lanestream_client.redaction import redact_urls, with_escaped_login
+from lanestream_client.redaction import redact_urls
 
 if TYPE_CHECKING:
     import av
@@ -47,18 +47,17 @@ class DecodedFrame:
 
 
 def open_video(
-    location: str, *, rtsp_transport: str | None = None, timeout_s: float | None = None
+    url: str, options: Mapping[str, str] | None = None, *, timeout_s: float | None = None
 ) -> av.container.InputContainer:
-    """Opens a video file or URL. `timeout_s` limits opening it, and later each wait for data; None means no limit.
+    """Opens a video by its URL, with `options` of FFmpeg.
 
-    Raises VideoError if it can't be opened or has no video, and its subclass VideoRefusedError if the server refuses.
+    `timeout_s` limits opening it, and later each wait for data; None means no limit. Raises VideoError if it can't be
+    opened or has no video, and its subclass VideoRefusedError if the server refuses.
     """
     with needs_extra("video"):
         import av
-    location = with_escaped_login(location) if "://" in location else location
-    options = {} if rtsp_transport is None else {"rtsp_transport": rtsp_transport}
     try:
-        container = av.open(location, options=options, timeout=timeout_s)
+        container = av.open(url, options=dict(options or {}), timeout=timeout_s)
     except av.error.ExitError:
         raise VideoError(f"no answer within {timeout_s or 0:g} s") from None
     except (

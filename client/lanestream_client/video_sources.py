@@ -10,10 +10,11 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from lanestream.errors import SourceError, needs_extra
+from lanestream.errors import LanestreamError, SourceError, needs_extra
 from lanestream_client.frames import CameraSource, SourceCounts, SourceFrame
 from lanestream_client.live_source import Feed, LiveSource
-from lanestream_client.redaction import redact_url
+from lanestream_client.proxies import find_proxy
+from lanestream_client.redaction import redact_url, with_escaped_login
 from lanestream_client.video_decoding import (
     DecodedFrame,
     VideoError,
@@ -36,6 +37,8 @@ SOURCE_HINT: Final = "use a video file, a folder of images, an image, a camera n
 _NETWORK_TIMEOUT_S: Final = 10.0
 # A recording that ends before this share of its duration was cut off. Its duration is often an estimate.
 _SHORTEST_SHARE: Final = 0.9
+_RTSP: Final = frozenset({"rtsp", "rtsps"})
+_HTTP: Final = frozenset({"http", "https"})
 _NO_TIMESTAMPS: Final = 0x80  # FFmpeg's AVFMT_NOTIMESTAMPS
 
 
@@ -43,7 +46,7 @@ _NO_TIMESTAMPS: Final = 0x80  # FFmpeg's AVFMT_NOTIMESTAMPS
 def open_video_file(path: str) -> Iterator[CameraSource]:
     """Opens a video file. Raises SourceError if it can't be read."""
     try:
-        container = open_video(path)
+        container = open_video(f"file:{path}")  # so that no name is taken for a URL, such as 12:30.mp4
     except VideoError as error:
         known = why_unreadable(Path(path))
         reason, hint = (str(error), SOURCE_HINT) if known is None else known
@@ -64,7 +67,8 @@ def open_network_stream(
         with ThreadPoolExecutor(1) as thread:
             opened = thread.submit(_open_network, url, transport, counts).result()
     except VideoError as error:
-        raise SourceError(f"can't open {name}: {error}", SOURCE_HINT) from None
+        hint = SOURCE_HINT if _is_direct(url) else "check the camera and the proxy, or add the camera to NO_PROXY"
+        raise SourceError(f"can't open {name}: {error}", hint) from None
     if not isinstance(opened, Feed):
         with opened:
             yield _recording(opened, name)
@@ -87,9 +91,9 @@ def _open_network(url: str, transport: RtspTransport, counts: SourceCounts) -> F
     Raises VideoError.
     """
     failures: list[str] = []
-    for name in _transports(url, transport):
+    for options in _options(url, transport):
         try:
-            container = open_video(url, rtsp_transport=name, timeout_s=_NETWORK_TIMEOUT_S)
+            container = open_video(with_escaped_login(url), options, timeout_s=_NETWORK_TIMEOUT_S)
             # The size of a playlist is not that of its stream.
             has_size = container.size > 0 and not container.format.name.startswith(("hls", "dash"))
             if has_size or (container.duration or 0) > 0:
@@ -116,13 +120,29 @@ def _live_feed(container: av.container.InputContainer, counts: SourceCounts) -> 
     return Feed(chain([first], frames), _frame_rate(container), _has_times(container), container.close)
 
 
-def _transports(url: str, transport: RtspTransport) -> list[str | None]:
-    scheme = url.partition("://")[0].lower()
-    if scheme not in {"rtsp", "rtsps"}:
-        return [None]
-    if transport == "auto":
-        return ["tcp", "udp"] if scheme == "rtsp" else ["tcp"]
-    return [transport]
+def _options(url: str, transport: RtspTransport) -> list[dict[str, str]]:
+    """Returns FFmpeg's options for a URL; for RTSP, those of each transport that is to be tried."""
+    scheme = _scheme(url)
+    if scheme in _RTSP:
+        both = transport == "auto" and scheme == "rtsp"
+        names = ["tcp", "udp"] if both else ["tcp" if transport == "auto" else transport]
+        return [{"rtsp_transport": name} for name in names]
+    # FFmpeg knows no networks in NO_PROXY, and would ask a proxy for cameras of this machine.
+    return [{"http_proxy": ""} if scheme in _HTTP and _is_direct(url) else {}]
+
+
+def _is_direct(url: str) -> bool:
+    """Returns whether no proxy is set for a URL, by the rules for services."""
+    if _scheme(url) not in _HTTP:
+        return True
+    try:
+        return find_proxy(with_escaped_login(url)) is None
+    except (LanestreamError, ValueError):
+        return False
+
+
+def _scheme(url: str) -> str:
+    return url.partition("://")[0].lower()
 
 
 def _recording(container: av.container.InputContainer, name: str) -> CameraSource:

@@ -64,6 +64,10 @@ _MIN_TRACKING_WIDTH: Final = 150
 @click.option(
     "--format", "format_name", type=click.Choice([AUTO, *FORMATS]), default=AUTO, help="The format of your labels."
 )
+@click.option(
+    "--no-road", type=click.IntRange(0), default=200, show_default=True, metavar="PICTURES",
+    help="Random pictures without a road to evaluate on, too.",
+)  # fmt: skip
 @click.pass_context
 def evaluate(
     context: click.Context,
@@ -75,11 +79,13 @@ def evaluate(
     data: Path | None,
     manifest: Path | None,
     format_name: str,
+    no_road: int,
 ) -> None:
     """Evaluate model files and two classical baselines on labeled frames.
 
-    Figures are for candidates (level A), boundaries of single images and of clips (B), and the field's metrics (C);
-    docs/evaluation.md describes each. A folder of labeled frames given with --data is evaluated as single images.
+    Figures are for candidates (level A), boundaries of single images and of clips (B), the field's metrics (C), and
+    pictures without a road; docs/evaluation.md describes each. A folder of labeled frames given with --data is
+    evaluated as single images.
     """
     if context.invoked_subcommand is not None:
         _refuse_options(context)
@@ -87,7 +93,10 @@ def evaluate(
     _check_targets(out, json_path)
     evaluation_set = _evaluation_set(data, manifest, format_name, split)
     evaluation = run_evaluation(
-        _methods(models, regressor), evaluation_set, lambda stage: click.echo(f"measuring {stage} ...", err=True)
+        _methods(models, regressor),
+        evaluation_set,
+        lambda stage: click.echo(f"measuring {stage} ...", err=True),
+        no_road,
     )
     figures = evaluation.figures()
     console = Console(width=max(_MIN_WIDTH, Console().width))

@@ -101,6 +101,21 @@ def test_detect_reports_every_image_and_continues_after_a_bad_one(run: Run, tmp_
     assert re.match(rf"{folder}/2.png: 2 boundaries, ego left and right, \d+\.\d ms\n", output)
 
 
+def test_jpegs_without_an_end_marker_are_read_and_flagged(run: Run, tmp_path: Path, url: str) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"{number}.jpg").write_bytes(fakes.image_file()[: None if number == 0 else -2])
+    text = "the JPEG has no end marker; if it was cut short, its last pixels are missing\n"
+    code, output, errors = run("detect", folder)
+    assert (code, "3 answered" in output) == (0, True)
+    assert errors == f"warning: {folder}/1.jpg: {text}warning: {folder}/2.jpg: {text}"
+    for where in ([], ["--url", url]):
+        code, output, errors = run("stream", folder, *where)
+        assert (code, "3 answered" in output) == (0, True)
+        assert errors == f"warning: frame 1: {text}"  # once in a stream
+
+
 def test_detect_writes_only_json_to_standard_output(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(fakes.image_file())
     code, output, errors = run("detect", "a.jpg", "--jsonl", "-")
@@ -425,7 +440,7 @@ def test_an_interrupted_stream_prints_its_report(tmp_path: Path, real_engine: En
         for _ in range(10):  # each is written before its frame is drawn
             assert process.stdout.readline().startswith('{"type": "lanes"')
         process.send_signal(signal.SIGINT)
-        output, errors = process.communicate(timeout=fakes.WAIT_S)
+        output, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "frames/s" in output
     assert "Traceback" not in errors

@@ -296,3 +296,19 @@ def test_a_silent_camera_can_not_be_opened(monkeypatch: pytest.MonkeyPatch) -> N
     ):
         pass
     assert camera.setups == ["tcp", "udp"]
+
+
+def test_a_camera_is_reached_without_a_proxy_as_no_proxy_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        proxy = f"http://127.0.0.1:{unused.getsockname()[1]}"
+    for name in ("http_proxy", "HTTP_PROXY"):
+        monkeypatch.setenv(name, proxy)
+    with MjpegCamera(JPEGS) as camera:
+        assert len(read(camera)[0]) == 12
+    with pytest.raises(SourceError, match=r"can't open http://camera\.test/live: connection refused") as caught:
+        open_source("http://camera.test/live").__enter__()
+    assert caught.value.hint == "check the camera and the proxy, or add the camera to NO_PROXY"
+    monkeypatch.setenv("no_proxy", "10.0.0.0/8")
+    options = [{"http_proxy": ""}], [{"http_proxy": ""}], [{}]
+    urls = "http://u:p@10.0.0.7:8080/live", "https://10.0.0.8/live", "http://192.168.0.7/live"
+    assert tuple(video_sources._options(url, "auto") for url in urls) == options

@@ -21,6 +21,7 @@ from lanestream_exporter.evaluation.figures import boundary_figures, field_figur
 from lanestream_exporter.evaluation.kinds import kind_figures
 from lanestream_exporter.evaluation.lateral import lateral_figures
 from lanestream_exporter.evaluation.methods import Method
+from lanestream_exporter.evaluation.no_road import NoRoadOutcome, by_kind, no_road_figures, run_no_road
 from lanestream_exporter.evaluation.outcomes import FrameEvaluation
 from lanestream_exporter.evaluation.steadiness import steadiness
 from lanestream_exporter.evaluation.verdicts import verdicts
@@ -68,12 +69,13 @@ class ClipRun:
 
 @dataclass
 class Evaluation:
-    """The outcomes of every method: on images by method, on clips by method and clip."""
+    """The outcomes of every method: on images and on pictures without a road by method, on clips by method and clip."""
 
     evaluation_set: EvaluationSet
     methods: tuple[Method, ...]
     images: dict[str, list[FrameEvaluation]]
     clips: dict[str, dict[str, ClipRun]]
+    no_road: dict[str, list[NoRoadOutcome]]
 
     def figures(self) -> dict[str, Any]:
         """Returns all figures as written to the JSON file; docs/evaluation.md documents every key."""
@@ -85,6 +87,7 @@ class Evaluation:
             "datasets": {name: _part_figures(by_dataset(outcomes)) for name, outcomes in self.images.items()},
             "conditions": {name: _part_figures(by_condition(outcomes)) for name, outcomes in self.images.items()},
             "clips": {method.name: self._clip_figures(method) for method in self.methods},
+            "no_road": {name: _no_road_figures(outcomes) for name, outcomes in self.no_road.items()},
         }
         return {**figures, "verdicts": verdicts(figures)}
 
@@ -145,6 +148,12 @@ def _part_figures(parts: Mapping[str, Sequence[FrameEvaluation]]) -> dict[str, A
     return {name: {"boundaries": boundary_figures(part), "kinds": kind_figures(part)} for name, part in parts.items()}
 
 
+def _no_road_figures(outcomes: Sequence[NoRoadOutcome]) -> dict[str, Any]:
+    if not outcomes:
+        return {}
+    return {kind: no_road_figures(part) for kind, part in {**by_kind(outcomes), OVERALL: outcomes}.items()}
+
+
 def _clip_groups(tracked: Sequence[FrameEvaluation], alone: Sequence[FrameEvaluation]) -> dict[str, Any]:
     return {
         "tracked": boundary_figures(tracked),
@@ -154,9 +163,14 @@ def _clip_groups(tracked: Sequence[FrameEvaluation], alone: Sequence[FrameEvalua
 
 
 def run_evaluation(
-    methods: Sequence[Method], evaluation_set: EvaluationSet, report: Callable[[str], None] = lambda _: None
+    methods: Sequence[Method],
+    evaluation_set: EvaluationSet,
+    report: Callable[[str], None] = lambda _: None,
+    no_road: int = 0,
 ) -> Evaluation:
-    """Runs every method on every frame of `evaluation_set`; `report` is called with the name of each stage.
+    """Runs every method on every frame of `evaluation_set`, and on `no_road` pictures without a road.
+
+    `report` is called with the name of each stage.
 
     Raises LabelError and SourceError if the frames can't be read, and LabelError if none is labeled.
     """
@@ -172,7 +186,9 @@ def run_evaluation(
             clips[name][clip.name] = run
     if methods and not images[methods[0].name] and not evaluation_set.clips:
         raise LabelError(f"{evaluation_set.name} has no labeled frames", "give labeled images")
-    return Evaluation(evaluation_set, tuple(methods), images, clips)
+    if no_road:
+        report("pictures without a road")
+    return Evaluation(evaluation_set, tuple(methods), images, clips, run_no_road(methods, no_road))
 
 
 def _track(methods: Sequence[Method], clip: LabeledClip) -> dict[str, ClipRun]:

@@ -48,6 +48,10 @@ class Method(Protocol):
         """Returns the name of the regressor that gives a classifier its ego-lane prior; None without one."""
         ...
 
+    def find(self, image: Image) -> tuple[ReportedBoundary, ...]:
+        """Returns the boundaries in a single BGR image (H, W, 3)."""
+        ...
+
     def detect(self, image: Image, frame: LabeledFrame) -> FrameEvaluation:
         """Evaluates a single BGR image (H, W, 3)."""
         ...
@@ -71,12 +75,15 @@ class ServedModel:
         has_prior = self._candidates is not None and self._candidates.regressor is not None
         self.regressor = engine.models["regressor"].name if has_prior else None
 
+    def find(self, image: Image) -> tuple[ReportedBoundary, ...]:
+        """Returns the boundaries in a single image."""
+        session = self._engine.open_session(SessionOptions(single_image=True))
+        return _reports(self._engine.process(session, image, 0.0))
+
     def detect(self, image: Image, frame: LabeledFrame) -> FrameEvaluation:
         """Evaluates a single image."""
-        session = self._engine.open_session(SessionOptions(single_image=True))
-        reports = _reports(self._engine.process(session, image, 0.0))
         candidates = None if self._candidates is None else self._judge(self._candidates, *to_working(frame, image))
-        return FrameEvaluation(frame, reports, candidates)
+        return FrameEvaluation(frame, self.find(image), candidates)
 
     def _judge(self, detector: CandidateDetector, frame: LabeledFrame, image: Image) -> JudgedCandidates:
         """Judges the candidates of a working image: the same search as in `detect`, with more results."""
@@ -117,9 +124,13 @@ class Baseline:
         self._detector = detector
         self.name = detector.name
 
+    def find(self, image: Image) -> tuple[ReportedBoundary, ...]:
+        """Returns the boundaries in a single image."""
+        return self._detector.detect(image)
+
     def detect(self, image: Image, frame: LabeledFrame) -> FrameEvaluation:
         """Evaluates a single image."""
-        return FrameEvaluation(frame, self._detector.detect(image))
+        return FrameEvaluation(frame, self.find(image))
 
     def start_clip(self) -> ClipTracker:
         """Returns the detector itself, without state."""

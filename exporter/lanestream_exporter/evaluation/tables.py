@@ -20,13 +20,14 @@ _CANDIDATES = ("base rate", "P", "R", "Acc", "AP")
 _DECISIONS = (*_CANDIDATES, "ego prop.", "all prop.")
 _BOUNDARIES = ("frames", "right", "wrong", "missed", "ego base", "ego P", "ego R", "px", "all P", "all R", "all F1")
 _KINDS = ("marked", "of", "edge P", "edge R", "type", "of", "constant", "color", "of", "constant")
+_NO_ROAD = ("pictures", "boundary", "marking", "ego lane", "share")
 _KINDS_TITLE = "Frames without markings in which one is reported, edges of the road, types and colors"
 _LITTLE = f"* says little: more than {HIGH_BASE_RATE:.0%} of what is judged are boundaries (base rate)"
 
 
 def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     """Yields the tables of each level, with a section per drive and a row per method."""
-    images, clips = figures["images"], figures["clips"]
+    images, clips, no_road = figures["images"], figures["clips"], figures["no_road"]
     for title, parts in (("data set", figures["datasets"]), ("condition", figures["conditions"])):
         if any(parts.values()):
             yield _table(f"Boundaries by {title}, single images", _BOUNDARIES, parts, _on_images)
@@ -34,6 +35,9 @@ def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     yield _table(f"{_KINDS_TITLE}, single images", _KINDS, images, lambda groups: _kinds(groups["kinds"]))
     if any(clips.values()):
         yield _table(f"{_KINDS_TITLE}, clips with the tracker", _KINDS, clips, _tracked_kinds)
+    if any(no_road.values()):
+        overall = {method: {"overall": kinds["overall"]} for method, kinds in no_road.items()}
+        yield _table("Pictures without a road in which something is reported", _NO_ROAD, overall, _no_road)
     yield _table("A. Candidates, by the classifier's probability: false beyond 40 px", _CANDIDATES, images, _candidates)
     yield _table("A. Candidates, by the detector's decision, and proposal recall with 16", _DECISIONS, images, _decided)
     yield _table("B. Single images: boundaries, error in px at 640 wide", _BOUNDARIES, images, _on_images)
@@ -61,6 +65,10 @@ def _kinds(kinds: Mapping[str, Any]) -> list[float | str | None]:
     for part in (kinds["types"], kinds["colors"]):
         cells += [part["right_share"], part["markings"], part["constant_share"]]
     return cells
+
+
+def _no_road(part: Mapping[str, Any]) -> list[float | str | None]:
+    return [part[key] for key in ("pictures", "with_boundary", "with_marking", "with_ego_lane", "share")]
 
 
 def _candidates(groups: Mapping[str, Any]) -> list[float | str | None]:

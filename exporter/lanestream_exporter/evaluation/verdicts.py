@@ -12,9 +12,9 @@ Groups = Mapping[str, Any]
 
 
 def verdicts(figures: Groups) -> list[str]:
-    """Returns the lines on top of an evaluation: each method, each data set, clips, and warnings.
+    """Returns the lines on top of an evaluation: each method, each data set, clips, no roads, and warnings.
 
-    `figures` are those of the JSON file. Data sets and clips are those of the first method.
+    `figures` are those of the JSON file. Data sets, clips and no roads are those of the first method.
     """
     first = next(iter(figures["methods"]))
     lines = [f"{name}: {_boundaries(drives['overall']['boundaries'])}" for name, drives in figures["images"].items()]
@@ -24,6 +24,7 @@ def verdicts(figures: Groups) -> list[str]:
     if clips:
         whole = clips["overall"]
         lines.append(f"clips with the tracker: {_boundaries(whole['tracked'])}{_looks(whole['kinds']['tracked'])}")
+    lines += _no_road(figures["no_road"][first])
     return [*lines, *_warnings(figures["images"][first]["overall"], figures["datasets"][first])]
 
 
@@ -91,6 +92,15 @@ def _kinds(kinds: Groups) -> Iterator[str]:
                 f"{name} of markings, single images: {part['right']} of {part['markings']} right; always the most "
                 f"frequent one: {round(part['constant_share'] * part['markings'])}"
             )
+
+
+def _no_road(kinds: Groups) -> Iterator[str]:
+    if kinds:
+        part = kinds["overall"]
+        yield (
+            f"pictures without a road: a boundary reported in {part['with_boundary']} of {part['pictures']}, a marking "
+            f"in {part['with_marking']}, both ego boundaries in {part['with_ego_lane']}"
+        )
 
 
 def _warnings(overall: Groups, datasets: Groups) -> Iterator[str]:

@@ -5,7 +5,7 @@ on the ground is a function of road coordinates: s meters along the road and u m
 `projection.py` maps every pixel to (s, u) once per frame, so that paint, wear and shadows move with the road. Labels
 come from the inverse of the same mapping. `tracking_clips.py` samples clips for measuring trackers.
 
-`no_road.py` makes pictures in which a detector must find nothing.
+`no_road` makes pictures in which a detector must find nothing.
 """
 
 from lanestream_exporter.scenes.clip import Clip, Drive, render_clip, sample_clip, write_clip

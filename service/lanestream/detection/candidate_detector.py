@@ -42,8 +42,8 @@ _TRACKED: Final = 0.16
 # closer to a marking.
 _CLOSEST: Final = 0.8
 _CLOSEST_EDGE: Final = 0.2
-# The road ends at its edge: what lies beyond one has this share of its odds. Usually it is the far side of a sidewalk, a
-# fence or a row of parked vehicles.
+# The road ends at its edge: what lies beyond one has this share of its odds. Usually that is the far side of a sidewalk,
+# a fence or a row of parked vehicles.
 _BEYOND_EDGE: Final = 0.03
 
 
@@ -172,7 +172,7 @@ def _on_road(detections: tuple[Detection, ...], view: RoadView, threshold: float
             factor = reached + (1.0 - reached) * _BEYOND_EDGE
             p = each.probability * factor / (1.0 - each.probability + each.probability * factor)
             if p >= threshold:
-                kept.append(replace(each, probability=p))
+                kept.append(each if factor == 1.0 else replace(each, probability=p))
             reached *= 1.0 - p * each.appearance.road_edge
     return tuple(sorted(kept, key=lambda each: float(each.curve.x(view.bottom))))
 

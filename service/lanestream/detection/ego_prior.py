@@ -36,6 +36,8 @@ _HIGHEST_HORIZON, _LOWEST_HORIZON = -0.6, 0.9
 # whose sigma is above the second limit is not used for the search: the network does not know such roads.
 _UNCERTAIN: Final = 0.022
 _MOST_UNCERTAIN: Final = 0.1
+# A frame shows no road if the presence of both boundaries is less than this: more likely than not, neither exists.
+_LEAST_ROAD: Final = 0.5
 # Lateral positions are compared at these anchors: farther away all lines of a road are close together.
 _COMPARED: Final = REGRESSOR_ANCHORS[:2]
 # A curve within the second distance, in row offsets, of a boundary with at least the first presence is that boundary.
@@ -113,7 +115,8 @@ class EgoPrior:
 
     `sides` are -1 (left) and +1 (right). `curves` are in pixels of the working image below the horizon of `view`, and
     `sigma` (M, 2) in row offsets. `presence` (M,) is the probability that the boundary exists at all, and `road_edge`
-    (M,) that it is an edge of the road if it does.
+    (M,) that it is an edge of the road if it does. `road` is the probability that the frame shows a road: that of the
+    ego boundary, seen well or not, which is more likely to exist.
     """
 
     view: RoadView
@@ -122,6 +125,7 @@ class EgoPrior:
     sigma: FloatArray
     presence: FloatArray
     road_edge: FloatArray
+    road: float = 1.0
 
     @property
     def vanishing_point(self) -> VanishingPoint:
@@ -149,8 +153,10 @@ class EgoPrior:
 
         Roads have a marking every lane width, and edges anywhere outside the ego lane. The ego lane has its boundaries
         where the prior saw them, within their sigma (with the heavy tail of Student's t with three degrees of freedom),
-        and none between them.
+        and none between them. A frame without a road has no boundaries: all factors are zero.
         """
+        if self.road < _LEAST_ROAD:
+            return np.zeros((len(curves), 2))
         below = _COMPARED * self.view.depth
         rows = self.view.horizon + below
         positions = curves.x(rows) / below
@@ -260,6 +266,7 @@ class RoadRegressor:
             np.hypot(sigma, _LEAST_SIGMA),
             output.presence[seen],
             output.road_edge[seen],
+            float(output.presence.max()),
         )
 
 

@@ -109,13 +109,16 @@ def propose(
     fitted = (fitted or Curves.none(point.y)).below(point.y, view.bottom)
     fitted = fitted.take(np.flatnonzero(~are_duplicates(fitted, tracked, view).any(axis=1)))
     bright = Curves.concatenate([ranked.take(chosen[first]), fitted, ranked.take(chosen[~first])])
-    step_lines = find_step_lines(road.steps, point, width)
-    steps = point.curves(step_lines.positions[step_lines.strength >= _LEAST_STEPS])
+    steps, most_steps = Curves.none(point.y), 0
+    if road.steps is not None:
+        step_lines = find_step_lines(road.steps, point, width)
+        steps = point.curves(step_lines.positions[step_lines.strength >= _LEAST_STEPS])
+        most_steps = _MOST_STEPS_WITH_TRACKS if len(tracked) else limit // _PER_STEP
     every = Curves.concatenate([bright, steps])
     spans = visible_spans(every, view)
     is_tall = spans.visible & (spans.bottom - spans.top >= _SHORTEST * view.depth)
     usable = np.flatnonzero(is_tall[: len(bright)])
-    limit, most_steps = (MOST_WITH_TRACKS, _MOST_STEPS_WITH_TRACKS) if len(tracked) else (limit, limit // _PER_STEP)
+    limit = MOST_WITH_TRACKS if len(tracked) else limit
     strongest, others = usable[: limit - most_steps], usable[limit - most_steps :]
     along = len(bright) + np.flatnonzero(is_long(steps, spans.take(slice(len(bright), None)), view))
     steps, lines_before = every.take(along), every.take(strongest)
@@ -134,11 +137,13 @@ def is_long(curves: Curves, spans: Spans, view: RoadView) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _Road:
-    """The vanishing point of a frame, its ridges and steps, and its Hough lines if no prior led to that point."""
+    """The vanishing point of a frame, its ridges, its steps if it may have an edge that the ridges do not show, and its
+    Hough lines if no prior led to that point.
+    """
 
     point: VanishingPoint
     ridges: Ridges
-    steps: Ridges
+    steps: Ridges | None = None
     hough: HoughLines | None = None
 
 
@@ -147,9 +152,13 @@ def _search_road(channels: Channels, context: FrameContext, prior: EgoPrior | No
     height, width = channels.paint.shape
     if prior is not None and prior.sides:
         guess = prior.vanishing_point
-        ridges, steps = find_ridges(channels.paint, guess), find_steps(channels, guess)
+        ridges, is_edge = find_ridges(channels.paint, guess), prior.road_edge > 0.5
+        if len(prior.sides) == 2 and not is_edge.any():
+            # Beyond the two markings of a lane, lines along steps show no edge that the other lines miss.
+            return _Road(refine(guess, ridges, width, height - 1.0, NEAR_PRIOR), ridges)
+        steps = find_steps(channels, guess)
         # Between two edges of a road without markings, ridges are noise.
-        evidence = replace(steps, weight=np.abs(steps.weight)) if (prior.road_edge > 0.5).all() else ridges
+        evidence = replace(steps, weight=np.abs(steps.weight)) if is_edge.all() else ridges
         return _Road(refine(guess, evidence, width, height - 1.0, NEAR_PRIOR), ridges, steps)
     horizon = context.horizon
     if horizon is not None:

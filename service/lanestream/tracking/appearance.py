@@ -46,6 +46,8 @@ def accumulated(past: Appearance, seen: Appearance, seconds: float, paint: float
 
 def forgotten(past: Appearance, seconds: float) -> Appearance:
     """Returns what is still known of a boundary that was last detected `seconds` ago."""
+    if seconds == 0.0:
+        return past
     road_edge, _ = _redrawn((past.road_edge, 1.0 - past.road_edge), _KIND_RATE * seconds)
     types = None if past.types is None else _redrawn(past.types, _TYPE_RATE * seconds)
     colors = None if past.colors is None else _redrawn(past.colors, _COLOR_RATE * seconds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import threading
 from collections.abc import Iterator
@@ -40,6 +41,18 @@ def test_frames_of_a_video_have_its_timestamps(tmp_path: Path) -> None:
     assert [frame.timestamp for frame in frames] == pytest.approx(times, abs=1e-4)
     assert [round(float(frame.image().mean()) / 25) for frame in frames] == [0, 1, 2, 3]
     assert read_header(frames[0].encoded()).kind == "JPEG"
+
+
+@pytest.mark.parametrize(
+    "name", [b"vid\xe9o.mp4", b"12:30:01.mp4", b"pipe:0", b"drive 10% #2?.mp4", "日本.mp4".encode()]
+)
+def test_a_video_may_have_any_name(tmp_path: Path, name: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / os.fsdecode(name)
+    Path(write_video(tmp_path / "a.mp4", [0.0, 0.04])).rename(path)
+    monkeypatch.chdir(tmp_path)
+    for spec in (path, path.name):
+        with open_source(str(spec)) as source:
+            assert len(list(source.frames)) == 2
 
 
 def test_a_folder_is_read_in_natural_order_and_its_files_are_not_reencoded(tmp_path: Path) -> None:

@@ -191,6 +191,7 @@ def figures_of(outcomes: list[FrameEvaluation]) -> dict[str, Any]:
         "images": {"net": {"overall": groups}},
         "datasets": {"net": {"town": groups}},
         "clips": {"net": {}},
+        "no_road": {"net": {}},
     }
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lanestream.detection.candidate_detector import CandidateDetector
 from lanestream.detection.classification import Classification
-from lanestream.detection.ego_prior import EgoPrior, LaneSpacing
+from lanestream.detection.ego_prior import EgoPrior, LaneSpacing, RegressorOutput, RoadRegressor
 from lanestream.detection.features import Channels
 from lanestream.detection.interface import FrameContext
 from lanestream.detection.proposals import Proposals, propose
@@ -211,3 +211,13 @@ def test_tracked_boundaries_come_after_those_of_the_prior_and_before_lines() -> 
     np.testing.assert_allclose(curves[place].x(rows), tracked[0].x(rows), atol=0.1)
     np.testing.assert_allclose(curves.x(rows)[:place], without.x(rows)[:place])
     assert place >= len(prior.sides)
+
+
+@pytest.mark.parametrize(("presence", "expected"), [((0.3, 0.49), 0.0), ((0.1, 0.5), 1.0)])
+def test_a_frame_in_which_neither_ego_boundary_is_likely_has_no_boundaries(
+    presence: tuple[float, float], expected: float
+) -> None:
+    output = RegressorOutput(np.full((2, 3), 0.1), np.full((2, 3), 0.01), np.array(presence), 0.0, np.zeros(2))
+    prior = RoadRegressor(0.6).prior(output, VIEW)
+    assert prior.sides == ()
+    np.testing.assert_array_equal(prior.odds(lines(-1.0, 0.4)), np.full((2, 2), expected))
