@@ -60,7 +60,7 @@ def _patch_geometry(_context: click.Context, _option: click.Parameter, value: st
 @click.option(
     "--rank-energy", type=click.FloatRange(0.5, 1.0),
     help="Share of the hidden layers' variance to keep; 1 keeps the layers unchanged."
-    "  [default: 0.998 for a classifier, 0.99996 for a regressor]",
+    "  [default: 0.998 for a classifier, 0.9999 for a regressor]",
 )  # fmt: skip
 @click.option(
     "--tolerance", type=click.FloatRange(0.0, 100.0), default=ExportSettings.tolerance, show_default=True,

@@ -1,3 +1,3 @@
 """Lanestream: camera frames in, tracked lane lines out."""
 
-__version__ = "0.12.0"
+__version__ = "0.13.0"

@@ -254,7 +254,7 @@ def test_a_replica_that_never_answers_is_skipped(use_async: bool) -> None:
         silent_url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         endpoints = parse_endpoints([one.url, silent_url, other.url])
         failover = FailoverPolicy(endpoints, RetryPolicy(attempt_s=0.1), 10.0)
-        protocol = ClientProtocol(start_message("all", None, None, None, None, None))
+        protocol = ClientProtocol(start_message("all", None, None, None, None, None, None))
         if use_async:
             results = asyncio.run(collect(AsyncLaneStream(failover, async_frames(frames(3)), protocol)))
         else:
