@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import select
-import signal
-import threading
-import time
+import subprocess
+import sys
 from pathlib import Path
 
 import av
@@ -55,29 +53,32 @@ def test_without_an_h264_encoder_the_video_is_mpeg4(tmp_path: Path, monkeypatch:
         assert container.streams.video[0].codec_context.name == "mpeg4"
 
 
+# Reads a pipe once it is full, so that its writer waits, and a Ctrl-C has interrupted the writer.
+INTERRUPTING_READER = """
+import os, select, signal, sys, time
+path, writer = sys.argv[1], int(sys.argv[2])
+with open(path, "rb", buffering=0) as pipe:
+    other_writer = os.open(path, os.O_WRONLY)
+    while select.select([], [other_writer], [], 0)[1]:
+        time.sleep(0.01)
+    time.sleep(0.1)
+    os.kill(writer, signal.SIGINT)
+    os.close(other_writer)
+    while pipe.read(1 << 16):
+        pass
+"""
+
+
 def test_an_interrupt_while_a_video_is_written_is_not_lost(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     os.mkfifo(path)
-
-    def read() -> None:
-        with path.open("rb", buffering=0) as pipe:
-            other_writer = os.open(path, os.O_WRONLY)
-            while select.select([], [other_writer], [], 0)[1]:  # until the pipe is full, so that the writer waits
-                time.sleep(0.01)
-            time.sleep(0.1)
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-            os.close(other_writer)
-            while pipe.read(1 << 16):
-                pass
-
-    reader = threading.Thread(target=read)
-    reader.start()
     noise = np.random.default_rng(0)
-    with pytest.raises(KeyboardInterrupt), video_sink(path, 1.0) as sink:  # noqa: PT012
-        for number in range(200):
-            sink.write(noise.integers(0, 255, (180, 320, 3), np.uint8), float(number))
-    reader.join(fakes.WAIT_S)
-    assert not reader.is_alive()
+    # In another process: PyAV holds the lock of the interpreter while it closes a file.
+    with subprocess.Popen([sys.executable, "-c", INTERRUPTING_READER, path, str(os.getpid())]) as reader:
+        with pytest.raises(KeyboardInterrupt), video_sink(path, 1.0) as sink:  # noqa: PT012
+            for number in range(200):
+                sink.write(noise.integers(0, 255, (180, 320, 3), np.uint8), float(number))
+        assert reader.wait(fakes.WAIT_S) == 0
 
 
 def test_results_are_written_with_lanes_or_with_their_error(tmp_path: Path) -> None:
