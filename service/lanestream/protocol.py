@@ -53,19 +53,25 @@ DistortionCoefficient = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 
 class Message(BaseModel):
-    """A JSON object on the wire. An unknown field is an error, so that typing mistakes are noticed.
+    """A JSON object on the wire. Unknown fields of what a service sends are ignored: a later version may add some.
 
     `example` is shown in the AsyncAPI document. `replies` of a client message are the types of the messages that answer
     it.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True)
 
     example: ClassVar[dict[str, Any] | None] = None
     replies: ClassVar[tuple[str, ...]] = ()
 
 
-class CameraModel(Message):
+class StrictMessage(Message):
+    """A JSON object from a client. An unknown field is an error, so that typing mistakes are noticed."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class CameraModel(StrictMessage):
     """The camera parameters that coordinates in meters need, over a flat road.
 
     A camera file holds this object as JSON. Either `field_of_view` or `focal_length` is required. With `auto`, pitch or
@@ -117,7 +123,7 @@ class CameraModel(Message):
         return self
 
 
-class DepartureOptions(Message):
+class DepartureOptions(StrictMessage):
     """When to warn of lane departures, which needs a camera. The service's settings apply to missing fields."""
 
     vehicle_width: Annotated[float, Field(ge=0.5, le=4.0)] | None = Field(
@@ -131,7 +137,7 @@ class DepartureOptions(Message):
     )
 
 
-class StartMessage(Message):
+class StartMessage(StrictMessage):
     """Client: opens the stream. Without it, the first image opens the stream with the defaults.
 
     With the token of a session that still exists, the stream continues that session on another socket or another
@@ -168,7 +174,7 @@ class StartMessage(Message):
     )
 
 
-class FrameMessage(Message):
+class FrameMessage(StrictMessage):
     """Client: number, capture time and motion for the binary message that follows.
 
     The service assigns a missing number and a missing time.
@@ -188,7 +194,7 @@ class FrameMessage(Message):
     indicator: Indicator | None = Field(default=None, description="Direction indicator of the vehicle.")
 
 
-class EndMessage(Message):
+class EndMessage(StrictMessage):
     """Client: no more frames follow. The service answers the frames it holds, sends a summary and closes the socket."""
 
     example = {"type": "end"}

@@ -209,6 +209,7 @@ def test_the_commands_take_a_camera(
     assert lanestream(monkeypatch, command, str(frames), "--jsonl", str(results), *OPTIONS, *where) == 0
     *_, line = (json.loads(line) for line in results.read_text().splitlines())
     del line["file"]
+    assert line.pop("clock", None) == ("frame_rate" if command == "stream" else None)
     check_meters(line)
 
 

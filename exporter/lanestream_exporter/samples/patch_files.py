@@ -22,6 +22,7 @@ from lanestream_exporter.samples.cache import FIRST_HARD_FILE, NO_ROAD, SAMPLES_
 from lanestream_exporter.samples.hard_scenes import Committee, Disagreement
 from lanestream_exporter.samples.patches import Patches, PatchMaker
 from lanestream_exporter.samples.prior_regressor import PriorRegressor, load_prior_regressor
+from lanestream_exporter.samples.truth import NOTHING
 from lanestream_exporter.scenes import render_still, sample_picture, sample_scene
 
 # The name of the data set of rendered scenes.
@@ -56,6 +57,11 @@ class PatchStore:
 
     def __len__(self) -> int:
         return len(self.targets)
+
+    @property
+    def has_nothing(self) -> bool:
+        """Whether any patch certainly shows no boundary."""
+        return bool((self.targets[:, 0] == NOTHING).any())
 
     def patch(self, index: int) -> NDArray[np.uint8]:
         """Returns one RGB patch (H, W, 3)."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lanestream.errors import CheckpointError
+from lanestream.errors import CheckpointError, LabelError
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.alexnet import AlexNet, ClassifierLogits, load_torchvision_weights, normalize
 from lanestream_exporter.samples.augment import augmented
@@ -35,12 +35,15 @@ _TYPE_WEIGHT, _COLOR_WEIGHT = 0.3, 0.2
 class ClassifierTask:
     """Trains `network` to classify candidates, on a rendered or a real source, or on both.
 
-    `origin` is recorded with the run: where the patches came from.
+    `origin` is recorded with the run: where the patches came from. Raises LabelError if no source has patches without a
+    boundary to validate with.
     """
 
     def __init__(
         self, config: ClassifierConfig, network: AlexNet, sources: Sequence[PatchSource], origin: dict[str, Any]
     ) -> None:
+        if not any(source.check.has_nothing for source in sources):
+            raise LabelError("no patches without a boundary to validate with", "give more frames, or render scenes")
         self._config = config
         self._sources = {source.name: source for source in sources}
         self._drawn = {source.name: _cumulative_chances(source.train) for source in sources}

@@ -23,7 +23,8 @@ from lanestream_exporter.training.config import TrainingData
 class PatchSource:
     """Patches of one kind, `rendered` or `real`: those to train on, and those that choose the best network.
 
-    Raises LabelError if either lacks patches with or without a boundary.
+    Raises LabelError if either lacks patches with a boundary, or those to train on lack others. A few frames may have
+    none of these to validate with.
     """
 
     name: str
@@ -32,10 +33,10 @@ class PatchSource:
 
     def __post_init__(self) -> None:
         for store, use in ((self.train, "train on"), (self.check, "validate with")):
-            is_nothing = store.targets[:, 0] == NOTHING
-            for present, what in ((~is_nothing, "boundaries"), (is_nothing, "anything else")):
-                if not present.any():
-                    raise LabelError(f"no {self.name} patches of {what} to {use}", "give more frames")
+            if (store.targets[:, 0] == NOTHING).all():
+                raise LabelError(f"no {self.name} patches of boundaries to {use}", "give more frames")
+        if not self.train.has_nothing:
+            raise LabelError(f"no {self.name} patches without a boundary to train on", "give more frames")
 
     @property
     def counts(self) -> dict[str, Any]:

@@ -42,8 +42,8 @@ _TRACKED: Final = 0.16
 # closer to a marking.
 _CLOSEST: Final = 0.8
 _CLOSEST_EDGE: Final = 0.2
-# The road ends at its edge: what lies beyond one has this share of its odds. It is usually the far side of a sidewalk, a
-# fence or a row of parked vehicles.
+# The road ends at its edge: what lies beyond one has this share of its odds. It is usually the far side of a sidewalk,
+# a fence or a row of parked vehicles.
 _BEYOND_EDGE: Final = 0.03
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from lanestream.errors import LabelError
 from lanestream_exporter.alexnet import AlexNet, ClassifierLogits
 from lanestream_exporter.samples.patch_files import PatchStore, read_stores, write_store
 from lanestream_exporter.samples.patches import Patches
@@ -159,14 +160,29 @@ def test_frames_of_data_sets_and_drives_count_by_the_square_root_of_their_number
 EVERY_KIND = ((NOTHING, -1, -1), (MARKING, 1, 0), (MARKING, 0, 1), (ROAD_EDGE, -1, -1), (NOTHING | ROAD_EDGE, -1, -1))
 
 
+def stored(path: Path, targets: Targets) -> PatchStore:
+    """Writes patches of noise that have these targets, and reads them."""
+    pixels = np.random.default_rng(0).integers(0, 256, (len(targets), 64, 64, 3), dtype=np.uint8)
+    write_store(path, [("mine", Patches(pixels, np.array(targets, np.int8)))])
+    return read_stores([path])
+
+
 def task_of(folder: Path, targets: Targets) -> ClassifierTask:
     """Returns a task with real patches of noise that have these targets."""
-    pixels = np.random.default_rng(0).integers(0, 256, (len(targets), 64, 64, 3), dtype=np.uint8)
-    write_store(folder / "real.npz", [("mine", Patches(pixels, np.array(targets, np.int8)))])
-    store = read_stores([folder / "real.npz"])
+    store = stored(folder / "real.npz", targets)
     data = ClassifierData(rendered_scenes=0, real_share=1.0, final_real_share=1.0)
     config = ClassifierConfig(batch=200, network=SIZE, data=data)
     return ClassifierTask(config, starting_network(config), [PatchSource("real", store, store)], {})
+
+
+def test_some_patches_to_validate_with_show_no_boundary(tmp_path: Path) -> None:
+    every = stored(tmp_path / "all.npz", EVERY_KIND)
+    few = PatchSource("real", every, stored(tmp_path / "boundaries.npz", EVERY_KIND[1:]))
+    config = ClassifierConfig(network=SIZE)
+    network = starting_network(config)
+    with pytest.raises(LabelError, match=r"no patches without a boundary to validate with \(give more frames, or"):
+        ClassifierTask(config, network, [few], {})
+    ClassifierTask(config, network, [few, PatchSource("rendered", every, every)], {})
 
 
 @pytest.fixture

@@ -129,9 +129,12 @@ def test_a_source_needs_patches_with_and_without_a_boundary(tmp_path: Path) -> N
     edges = stored(tmp_path / "edges.npz", (ROAD_EDGE, -1, -1), (NOTHING | ROAD_EDGE, -1, -1))
     with pytest.raises(LabelError, match="no real patches of boundaries to train on"):
         PatchFiles("real", (nothing,), (edges,)).read()
-    with pytest.raises(LabelError, match="no real patches of anything else to validate with"):
-        PatchFiles("real", (nothing, edges), (edges,)).read()
-    PatchFiles("real", (nothing, edges), (edges, nothing)).read()
+    with pytest.raises(LabelError, match="no real patches without a boundary to train on"):
+        PatchFiles("real", (edges,), (edges, nothing)).read()
+    with pytest.raises(LabelError, match="no real patches of boundaries to validate with"):
+        PatchFiles("real", (nothing, edges), (nothing,)).read()
+    # A few frames whose labels leave much unknown may have no other patches to validate with; rendered scenes have.
+    PatchFiles("real", (nothing, edges), (edges,)).read()
 
 
 def test_a_source_counts_its_patches(tmp_path: Path) -> None:
