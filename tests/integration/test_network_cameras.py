@@ -135,8 +135,8 @@ def test_a_stream_is_stopped_while_its_camera_is_lost() -> None:
 @pytest.mark.parametrize("mode", ["all", "latest"])
 def test_a_silent_camera_can_be_interrupted(run: Run, mode: str) -> None:
     with MjpegCamera(JPEGS, stalls=True) as camera:
-        # PyAV loses an interrupt that comes while the main thread waits for data.
-        timer = threading.Timer(3.0, signal.raise_signal, [signal.SIGINT])
+        # Sent to the main thread, which waits for a frame that another thread reads.
+        timer = threading.Timer(3.0, signal.pthread_kill, [threading.get_ident(), signal.SIGINT])
         timer.start()
         code, output, _ = run(camera.url, "--mode", mode)
         timer.join()
