@@ -1,6 +1,6 @@
 """Measures what fine-tuning on N frames of new roads is worth, and prints the table of docs/training.md.
 
-LANESTREAM_DATA=../shared/data python tools/fine_tuning.py --run runs --models out
+python tools/fine_tuning.py --data ../shared/data
 
 The new roads are the Brazilian ones, which the first runs of the shipped networks have not seen (`make models`).
 Networks are fine-tuned from those runs with the shipped recipes, on frames of the training drives, of which about a
@@ -11,7 +11,6 @@ out/ are kept, so it can be interrupted.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -38,18 +37,19 @@ masks = [[0.84, 0.015, 0.99, 0.1]]
 
 
 @click.command(help=__doc__)
+@click.option("--data", type=click.Path(path_type=Path, exists=True), envvar="LANESTREAM_DATA", required=True)
 @click.option("--run", "runs", type=click.Path(path_type=Path), default=Path("runs"), show_default=True)
 @click.option("--models", type=click.Path(path_type=Path), default=Path("out"), show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/fine-tuning"), show_default=True)
-def main(runs: Path, models: Path, out: Path) -> None:
+def main(data: Path, runs: Path, models: Path, out: Path) -> None:
     """Fine-tunes and evaluates networks for every number of frames, and prints the table."""
-    data = Path(os.environ["LANESTREAM_DATA"]).resolve()
+    source = data.resolve() / FOLDER
     before = models / "classifier-first.onnx", models / "regressor-first.onnx"
-    rows = [(0, 0.0, evaluated(*before, out / "0.json"))]
+    rows = [(0, 0.0, evaluated(data, *before, out / "0.json"))]
     for size in SIZES:
         folder = out / str(size)
-        networks, minutes = fine_tuned(runs.resolve(), data / FOLDER, folder, size)
-        rows.append((size, minutes, evaluated(*networks, folder / "evaluation.json")))
+        networks, minutes = fine_tuned(runs.resolve(), source, folder, size)
+        rows.append((size, minutes, evaluated(data, *networks, folder / "evaluation.json")))
     print(
         "| frames | training, minutes | ego right | wrong | missed | error, px | other roads: right | wrong | missed |"
     )
@@ -93,11 +93,11 @@ def write_frames(source: Path, folder: Path, size: int) -> None:
         images.symlink_to(source / "images")
 
 
-def evaluated(classifier: Path, regressor: Path, file: Path) -> dict[str, Any]:
+def evaluated(data: Path, classifier: Path, regressor: Path, file: Path) -> dict[str, Any]:
     """Returns the figures of the validation drives of all data sets."""
     if not file.exists():
         models = "--model", classifier, "--regressor", regressor
-        lanestream("evaluate", *models, "--split", "val", "--no-road", "0", "--json", file)
+        lanestream("evaluate", *models, "--data", data, "--split", "val", "--no-road", "0", "--json", file)
     figures: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return figures
 

@@ -132,8 +132,8 @@ def why_unreadable(path: Path) -> tuple[str, str] | None:
         boxes = dict(_boxes(file, size))
         if b"moov" not in boxes:
             what = "it is a fragment without its header" if b"moof" in boxes else "the file has no index (`moov`)"
-            todo = "the recording or a copy was cut off: copy it again, or rebuild the index with a repair tool"
-            return what, todo
+            hint = "the recording or a copy was cut off: copy it again, or rebuild the index with a repair tool"
+            return what, hint
         if boxes[b"moov"] > size:
             return "the index (`moov`) is cut off", "the file is incomplete: copy it again from the camera"
     return None
