@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -47,7 +48,10 @@ def load(
         ) from error
     try:
         model = reader.convert(read)
-        compiled = openvino.Core().compile_model(model, "CPU", _properties(options.threads))
+        # Its CPU plugin gives the thread that starts it a signal stack, and frees it with the last network, in whatever
+        # thread that happens. A signal would then crash the thread, so it is one that ends before.
+        with ThreadPoolExecutor(1) as starter:
+            compiled = starter.submit(_compile, openvino, model, options).result()
     except Exception as error:
         raise ProviderError(
             f"OpenVINO can't run {path}: {runtime_message(error)}", "use the provider auto or cpu"
@@ -94,6 +98,10 @@ def _without_telemetry() -> Iterator[None]:
         yield
     finally:
         del sys.modules[_TELEMETRY]
+
+
+def _compile(openvino: Any, model: Any, options: RuntimeOptions) -> Any:
+    return openvino.Core().compile_model(model, "CPU", _properties(options.threads))
 
 
 def _properties(threads: int | None) -> Mapping[str, Any]:

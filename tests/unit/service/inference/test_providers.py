@@ -331,3 +331,26 @@ def test_openvino_sends_no_telemetry(tmp_path: Path) -> None:
     )
     assert done.stdout == "openvino False\n"
     assert not (tmp_path / "intel").exists()
+
+
+# OpenVINO's signal stack of the thread that loads a network is freed with the network.
+INTERRUPT_AFTER_OPENVINO = """
+import os, signal, sys, threading
+from pathlib import Path
+from lanestream.inference import openvino_model
+networks = [openvino_model.load(Path(sys.argv[1]))]
+thread = threading.Thread(target=networks.clear)
+thread.start()
+thread.join()
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    signal.pause()
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_a_process_can_be_interrupted_after_another_thread_freed_a_network_of_openvino() -> None:
+    command = [sys.executable, "-c", INTERRUPT_AFTER_OPENVINO, str(SHIPPED_MODEL)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (result.returncode, result.stdout) == (0, "interrupted\n"), result.stderr
