@@ -34,6 +34,11 @@ from lanestream.tracking.tracker import LaneTracker
 
 # The least weight of a new frame's horizon: bumps should not move the estimate, a minute of driving should.
 _HORIZON_GAIN: Final = 0.1
+# A horizon is doubtful after so many seconds in which the ego-lane prior was more uncertain than this. It is then
+# searched for again. One that is found this far away, in depths, replaces the estimate at once.
+_DOUBTFUL_S: Final = 1.0
+_UNCERTAIN: Final = 0.06
+_MOVED: Final = 0.1
 # The limits of a saved state: a side of a working image in pixels, and the row of a horizon as a share of the height.
 # Detectors place no horizon lower, because some road must be visible below it, and none higher: cameras that look down
 # have theirs up to the height of an image above it, and wide images are low.
@@ -99,13 +104,14 @@ class SessionState:
 
     `size` is the width and height of its working images. `horizon` is the camera's estimate and `prior_horizon` the
     ego-lane prior's in the last frame, both as shares of the height. `evidence` is the sum of the frames' horizon
-    weights.
+    weights, and `uncertain_s` for how long the prior has been uncertain.
     """
 
     size: tuple[int, int] | None = None
     horizon: float | None = None
     prior_horizon: float | None = None
     evidence: float = 0.0
+    uncertain_s: float = 0.0
     tracker: TrackerState = field(default_factory=TrackerState)
     calibration: CalibrationState = field(default_factory=CalibrationState)
     departure: DepartureState = field(default_factory=DepartureState)
@@ -118,6 +124,7 @@ class SessionState:
         check_range("horizon", self.horizon, *_HORIZONS)
         check_range("prior_horizon", self.prior_horizon, *_HORIZONS)
         check_range("evidence", self.evidence, 0.0, MAX_COUNT)
+        check_range("uncertain_s", self.uncertain_s, 0.0, _DOUBTFUL_S)
         self.tracker.validate()
         bottom = self.tracker.horizon + self.tracker.depth
         if self.tracker.filter and (self.size is None or abs(bottom + 1.0 - self.size[1]) > _ROUNDING):
@@ -143,6 +150,7 @@ class Session:
         self._horizon: float | None = None
         self._prior_horizon: float | None = None
         self._evidence = 0.0
+        self._uncertain_s = 0.0
         self._single_image, self._kinds = options.single_image, options.kinds
         self._tracker = LaneTracker(options.single_image, options.kinds)
         self._scene = SceneMemory()
@@ -156,6 +164,7 @@ class Session:
             self._horizon,
             self._prior_horizon,
             self._evidence,
+            self._uncertain_s,
             self._tracker.state,
             CalibrationState() if self._calibrator is None else self._calibrator.state,
             self._departure.state,
@@ -175,7 +184,7 @@ class Session:
         """
         self._tracker = LaneTracker.restored(state.tracker, ids_lost, self._single_image, self._kinds)
         self._size, self._horizon, self._evidence = state.size, state.horizon, state.evidence
-        self._prior_horizon = state.prior_horizon
+        self._prior_horizon, self._uncertain_s = state.prior_horizon, state.uncertain_s
         self._departure.state = state.departure
         self._scene = state.scene
         if self._calibrator is not None:
@@ -203,13 +212,14 @@ class Session:
         if self._camera is not None:
             lens = self._camera.lens(size or (image.shape[1], image.shape[0]), (width, height))
             middle = self._camera.middle(lens)
-        scene, is_cut = self._scene.next(working, self._tracker.seconds_until(timestamp))
+        seconds = self._tracker.seconds_until(timestamp)
+        scene, is_cut = self._scene.next(working, seconds)
         inference = _TimedInference(infer)
         context = self._context(image, working, scaling, lens, is_cut)
         detections = self._detector.detect(working, context, inference)
         detected = time.perf_counter()
         self._scene = scene
-        self._update_horizon(detections, is_cut)
+        self._update_horizon(detections, is_cut, context, seconds)
         result = self._tracker.update(detections.boundaries, timestamp, detections.view, middle, is_cut)
         if any(isinstance(event, SceneCut) for event in result.events):
             self._departure.state = DepartureState()
@@ -245,18 +255,27 @@ class Session:
             horizon=estimated if given is None else given,
             is_given=given is not None,
             tracked=self._tracker.curves if is_known else None,
+            confirmed=self._tracker.confirmed_curves if is_known else None,
             prior_horizon=None if self._prior_horizon is None or not is_known else self._prior_horizon * height,
+            is_doubtful=given is None and self._uncertain_s >= _DOUBTFUL_S,
         )
 
-    def _update_horizon(self, detections: Detections, is_cut: bool) -> None:
-        """Updates the horizon with a weighted mean of the frames' horizons that forgets old frames slowly."""
+    def _update_horizon(self, detections: Detections, is_cut: bool, context: FrameContext, seconds: float) -> None:
+        """Updates the horizon with a weighted mean of the frames' horizons that forgets old frames slowly.
+
+        The frame was `seconds` after the last one, and detected with this `context`.
+        """
         view = detections.view
         size = view.width, view.height
         if self._size not in (None, size):
             self._tracker = LaneTracker(self._single_image, self._kinds)
             self._departure.state = DepartureState()
-        if self._size not in (None, size) or is_cut:
+        expected = context.expected_horizon
+        found_anew = context.is_doubtful and expected is not None and abs(view.horizon - expected) > _MOVED * view.depth
+        if self._size not in (None, size) or is_cut or found_anew:
             self._horizon, self._evidence = None, 0.0
+        certain = detections.uncertainty <= _UNCERTAIN or context.is_doubtful
+        self._uncertain_s = 0.0 if certain else min(self._uncertain_s + seconds, _DOUBTFUL_S)
         self._size = size
         prior_horizon = detections.prior_horizon
         self._prior_horizon = None if prior_horizon is None else prior_horizon / view.height

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lanestream.detection.acceptance import Acceptance
 from lanestream.detection.classification import Classification
 from lanestream.detection.curve_fit import USUAL_OBLIQUITY, fit_curves
 from lanestream.detection.ego_prior import RoadRegressor
@@ -35,25 +36,26 @@ _COMPARED: Final = np.array([0.25, 0.5, 1.0])
 # is the mean of the candidates within _AVERAGED of it, measured across the line.
 _SAME: Final = 0.12
 _AVERAGED: Final = 0.25
-# The prior's boundaries are fitted to the paint and become candidates too, except within this distance, in row offsets,
-# of a tracked boundary, which is on the paint already.
+# Within this distance of a tracked boundary, in row offsets, is the same boundary. The prior's boundaries are fitted to
+# the paint and become candidates too, except near a confirmed boundary, which is on the paint already.
 _TRACKED: Final = 0.16
 # If two boundaries come closer than this, in row offsets, or cross, one of them is wrong. An edge of the road may be
 # closer to a marking.
 _CLOSEST: Final = 0.8
 _CLOSEST_EDGE: Final = 0.2
-# The road ends at its edge: what lies beyond one has this share of its odds. It is usually the far side of a sidewalk,
-# a fence or a row of parked vehicles.
-_BEYOND_EDGE: Final = 0.03
 
 
 @dataclass(frozen=True)
 class CandidateDetector:
-    """Accepts candidates whose probability reaches `threshold`. A `regressor`, if given, guides the search."""
+    """Finds boundaries among candidates whose probability reaches `threshold`, and reports those that it accepts.
+
+    A `regressor`, if given, guides the search.
+    """
 
     threshold: float
     patch: PatchGeometry = PatchGeometry()
     regressor: RoadRegressor | None = None
+    acceptance: Acceptance = Acceptance()
 
     def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
         """Returns the boundaries in a BGR working image (H, 640, 3) uint8."""
@@ -66,11 +68,14 @@ class CandidateDetector:
         channels = Channels.of(image)
         if self.regressor is None:
             return propose(channels, context, None, None, limit)
-        output, view = self.regressor.predict(image, context.expected_horizon, infer, is_given=context.is_given)
-        prior = self.regressor.prior(output, view)
+        output, view = self.regressor.predict(
+            image, context.expected_horizon, infer, is_given=context.is_given, is_doubtful=context.is_doubtful
+        )
+        is_tracking = context.tracked is not None and len(context.tracked) > 0
+        prior = self.regressor.prior(output, view, is_tracking=is_tracking)
         sides: Sequence[int] = (0, 1)
-        if context.tracked is not None:
-            is_tracked = are_duplicates(output.curves(view), context.tracked, view, _TRACKED)
+        if context.confirmed is not None:
+            is_tracked = are_duplicates(output.curves(view), context.confirmed, view, _TRACKED)
             sides = np.flatnonzero(~is_tracked.any(axis=1)).tolist()
         _, fits = fit_output(channels, output, view, self.regressor.threshold, sides)
         return propose(channels, context, prior, fits.curves, limit)
@@ -93,9 +98,9 @@ class CandidateDetector:
         order = np.argsort(-own, kind="stable")
         accepted = order[probability[order] >= self.threshold]
         prior = proposals.prior
-        prior_horizon = None if prior is None else prior.view.horizon
+        prior_horizon, uncertainty = (None, 0.0) if prior is None else (prior.view.horizon, prior.uncertainty)
         if not len(accepted):
-            return Detections((), proposals.view, proposals.horizon_weight, prior_horizon)
+            return Detections((), proposals.view, proposals.horizon_weight, prior_horizon, 0.0, uncertainty)
         curves, spans = proposals.curves.take(accepted), proposals.spans.take(accepted)
         gaps = np.abs(_gaps(curves, proposals.view)).max(axis=2)
         chosen = non_maximum_suppression(gaps <= _SAME)
@@ -123,9 +128,9 @@ class CandidateDetector:
             if visible.visible[i]
         ]
         separated = _separated(sorted(detections, key=lambda detection: -detection.probability), fits.view)
-        boundaries = _on_road(separated, fits.view, self.threshold)
+        boundaries = self.acceptance.accepted(separated, _are_tracked(separated, proposals), fits.view, self.threshold)
         fit_s = time.perf_counter() - started
-        return Detections(boundaries, fits.view, proposals.horizon_weight, prior_horizon, fit_s)
+        return Detections(boundaries, fits.view, proposals.horizon_weight, prior_horizon, fit_s, uncertainty)
 
 
 def _means(curves: Curves, weights: FloatArray, gaps: FloatArray, chosen: NDArray[np.intp], view: RoadView) -> Curves:
@@ -156,25 +161,16 @@ def _separated(detections: list[Detection], view: RoadView) -> tuple[Detection, 
     return tuple(sorted((detections[i] for i in kept.tolist()), key=lambda each: float(each.curve.x(view.bottom))))
 
 
-def _on_road(detections: tuple[Detection, ...], view: RoadView, threshold: float) -> tuple[Detection, ...]:
-    """Returns the detections that remain probable although edges of the road lie between them and the camera.
-
-    `detections` are sorted from left to right.
-    """
-    is_left = [float(each.curve.x(view.bottom)) < view.middle for each in detections]
-    kept: list[Detection] = []
-    for side in (
-        [each for each, left in zip(detections, is_left, strict=True) if left][::-1],
-        [each for each, left in zip(detections, is_left, strict=True) if not left],
-    ):
-        reached = 1.0
-        for each in side:
-            factor = reached + (1.0 - reached) * _BEYOND_EDGE
-            p = each.probability * factor / (1.0 - each.probability + each.probability * factor)
-            if p >= threshold:
-                kept.append(each if factor == 1.0 else replace(each, probability=p))
-            reached *= 1.0 - p * each.appearance.road_edge
-    return tuple(sorted(kept, key=lambda each: float(each.curve.x(view.bottom))))
+def _are_tracked(detections: Sequence[Detection], proposals: Proposals) -> list[bool]:
+    """Returns which of the detections are at the place of a boundary that was tracked to this frame."""
+    tracked = proposals.tracked
+    if tracked is None or not len(tracked) or not detections:
+        return [False] * len(detections)
+    curves = Curves.of([detection.curve for detection in detections])
+    horizon, bottom = proposals.view.horizon, proposals.view.bottom
+    same = are_duplicates(curves.below(horizon, bottom), tracked.below(horizon, bottom), proposals.view, _TRACKED)
+    near: list[bool] = np.asarray(same.any(axis=1)).tolist()
+    return near
 
 
 def _gaps(curves: Curves, view: RoadView) -> FloatArray:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+from lanestream.detection.acceptance import SHIPPED
 from lanestream.detection.candidate_detector import CandidateDetector
 from lanestream.detection.ego_prior import RoadRegressor
 from lanestream.detection.interface import Detector, ModelRole
@@ -62,7 +63,7 @@ def _candidates(models: ModelDescriptions) -> Detector | None:
     if classifier is None:
         return None
     prior = None if regressor is None else RoadRegressor(regressor.threshold, regressor.road_crop)
-    return CandidateDetector(classifier.threshold, classifier.patch, prior)
+    return CandidateDetector(classifier.threshold, classifier.patch, prior, SHIPPED)
 
 
 def _regression(models: ModelDescriptions) -> Detector | None:

@@ -27,8 +27,14 @@ REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
 # Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each. Neighbors differ by
 # about a sixth of the depth. A camera that looks down has its horizon above the picture.
 UNKNOWN_HORIZONS: Final = (-0.36, -0.16, 0.02, 0.17, 0.29, 0.39, 0.48, 0.57)
+# The network sees the row better the nearer its crop assumed it, so a row that was found is refined at most so often,
+# until it moves by less than this, in depths.
+_REFINEMENTS: Final = 3
+_SETTLED: Final = 0.01
 # How far a given horizon moves with the vehicle's pitch, in depths.
 _MOST_PITCH: Final = 0.05
+# A doubtful horizon is given up for one with less than this share of its uncertainty.
+_CLEARER: Final = 0.75
 # The limits of the horizon, as shares of the height.
 _HIGHEST_HORIZON, _LOWEST_HORIZON = -0.6, 0.9
 
@@ -36,8 +42,9 @@ _HIGHEST_HORIZON, _LOWEST_HORIZON = -0.6, 0.9
 # whose sigma is above the second limit is not used for the search: the network does not know such roads.
 _UNCERTAIN: Final = 0.022
 _MOST_UNCERTAIN: Final = 0.1
-# A frame shows no road if the presence of both boundaries is less than this: more likely than not, neither exists.
-_LEAST_ROAD: Final = 0.5
+# A frame shows no road if the presence of both boundaries is less than the first: more likely than not, neither exists.
+# After a frame with boundaries that is less likely: the odds are a third.
+_LEAST_ROAD: Final = (0.5, 0.25)
 # Lateral positions are compared at these anchors: farther away all lines of a road are close together.
 _COMPARED: Final = REGRESSOR_ANCHORS[:2]
 # A curve within the second distance, in row offsets, of a boundary with at least the first presence is that boundary.
@@ -80,6 +87,10 @@ class RegressorOutput:
         """The mean standard deviation, plus a little for a horizon that is not where the crop assumed it."""
         return float(self.sigma.mean() + 0.05 * abs(self.horizon))
 
+    def is_clearer_than(self, other: RegressorOutput) -> bool:
+        """Whether it shows a road, and with much less uncertainty than `other`."""
+        return bool(self.presence.max() >= _LIKELY and self.uncertainty < _CLEARER * other.uncertainty)
+
     @property
     def mirrored(self) -> RegressorOutput:
         """The output of a mirrored crop, mirrored back."""
@@ -115,8 +126,8 @@ class EgoPrior:
 
     `sides` are -1 (left) and +1 (right). `curves` are in pixels of the working image below the horizon of `view`, and
     `sigma` (M, 2) in row offsets. `presence` (M,) is the probability that the boundary exists at all, and `road_edge`
-    (M,) that it is an edge of the road if it does. `road` is the probability that the frame shows a road: that of the
-    ego boundary, seen well or not, which is more likely to exist.
+    (M,) that it is an edge of the road if it does. If not `shows_road`, neither boundary is likely enough to exist,
+    seen well or not. `uncertainty` is that of the network's output.
     """
 
     view: RoadView
@@ -125,7 +136,8 @@ class EgoPrior:
     sigma: FloatArray
     presence: FloatArray
     road_edge: FloatArray
-    road: float = 1.0
+    shows_road: bool = True
+    uncertainty: float = 0.0
 
     @property
     def vanishing_point(self) -> VanishingPoint:
@@ -155,7 +167,7 @@ class EgoPrior:
         where the prior saw them, within their sigma (with the heavy tail of Student's t with three degrees of freedom),
         and none between them. A frame without a road has no boundaries: all factors are zero.
         """
-        if self.road < _LEAST_ROAD:
+        if not self.shows_road:
             return np.zeros((len(curves), 2))
         below = _COMPARED * self.view.depth
         rows = self.view.horizon + below
@@ -222,21 +234,18 @@ class RoadRegressor:
     geometry: RoadCropGeometry = RoadCropGeometry()
 
     def predict(
-        self, image: Image, horizon: float | None, infer: Infer, *, is_given: bool = False
+        self, image: Image, horizon: float | None, infer: Infer, *, is_given: bool = False, is_doubtful: bool = False
     ) -> tuple[RegressorOutput, RoadView]:
         """Returns the output for a BGR working image, and the view with the horizon that the network sees.
 
         `horizon` is its approximate row. If it is None, the network runs once for each of several rows, and again near
-        the one with the least uncertainty. If it `is_given`, it is wrong only by the vehicle's pitch.
+        the one with the least uncertainty. If it `is_doubtful`, it has to compete with these rows. If it `is_given`, it
+        is wrong only by the vehicle's pitch.
         """
         height, width = image.shape[:2]
         detail = resized(image, self.geometry.detail_width / width)
-        if horizon is None:
-            views = [RoadView(width, height, share * height) for share in UNKNOWN_HORIZONS]
-            crops = np.stack([self.crop(detail, view) for view in views])
-            outputs = [RegressorOutput.of(row) for row in infer("regressor", crops)]
-            best = min(range(len(views)), key=lambda i: outputs[i].uncertainty)
-            horizon = outputs[best].view(views[best]).horizon
+        if horizon is None or (is_doubtful and not is_given):
+            horizon = self._search(detail, RoadView(width, height, 0.0), horizon, infer)
         view = RoadView(width, height, float(np.clip(horizon, _HIGHEST_HORIZON * height, 0.85 * height)))
         crop = self.crop(detail, view)
         output = RegressorOutput.of(infer("regressor", crop[None])[0])
@@ -248,14 +257,37 @@ class RoadRegressor:
             output = replace(output, horizon=float(np.clip(output.horizon, -_MOST_PITCH, _MOST_PITCH)))
         return output, output.view(view)
 
+    def _search(self, detail: Image, view: RoadView, expected: float | None, infer: Infer) -> float:
+        """Returns the row of the horizon that the network sees with the least uncertainty.
+
+        That is the `expected` row unless it is clearly another one.
+        """
+        rows = [share * view.height for share in UNKNOWN_HORIZONS]
+        views = [view.with_horizon(row) for row in (rows if expected is None else [expected, *rows])]
+        crops = np.stack([self.crop(detail, each) for each in views])
+        outputs = [RegressorOutput.of(row) for row in infer("regressor", crops)]
+        best = min(range(len(views)), key=lambda i: outputs[i].uncertainty)
+        if expected is not None and not outputs[best].is_clearer_than(outputs[0]):
+            return expected
+        found = outputs[best].view(views[best])
+        for _ in range(_REFINEMENTS):
+            before = found
+            found = RegressorOutput.of(infer("regressor", self.crop(detail, before)[None])[0]).view(before)
+            if abs(found.horizon - before.horizon) < _SETTLED * found.depth:
+                break
+        return found.horizon
+
     def crop(self, detail: Image, view: RoadView) -> NDArray[np.uint8]:
         """Returns the road crop (size, size, 3) in RGB of `detail`, a working image at the detail width."""
         columns, rows = self.geometry.grid(view, Scaling(detail.shape[1] / view.width))
         crop = cv2.remap(detail, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
-    def prior(self, output: RegressorOutput, view: RoadView) -> EgoPrior:
-        """Returns the boundaries of an output that are present and certain enough to guide the search."""
+    def prior(self, output: RegressorOutput, view: RoadView, *, is_tracking: bool = False) -> EgoPrior:
+        """Returns the boundaries of an output that are present and certain enough to guide the search.
+
+        If boundaries were tracked to this frame (`is_tracking`), it still shows a road as long as that is possible.
+        """
         seen = (output.presence >= self.threshold) & (output.sigma.mean(axis=1) <= _MOST_UNCERTAIN)
         sigma = output.sigma[seen, : len(_COMPARED)] * view.width / (_COMPARED * view.depth)
         sides = _sides(seen.tolist())
@@ -266,7 +298,8 @@ class RoadRegressor:
             np.hypot(sigma, _LEAST_SIGMA),
             output.presence[seen],
             output.road_edge[seen],
-            float(output.presence.max()),
+            float(output.presence.max()) >= _LEAST_ROAD[is_tracking],
+            output.uncertainty,
         )
 
 

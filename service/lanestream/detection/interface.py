@@ -26,15 +26,18 @@ Infer = Callable[[ModelRole, NDArray[np.uint8]], NDArray[np.float32]]
 class FrameContext:
     """What is known about a frame before detection, in pixels of the working image.
 
-    `horizon` is its row, `tracked` are the boundaries of the last frame, and `prior_horizon` is the row that the
-    ego-lane prior of the last frame gave; each is None if unknown. The prior's row is steadier, because it does not
-    depend on which boundaries are found. If `is_given`, the horizon is known from outside, except for pitch.
+    `horizon` is its row, `tracked` are the boundaries of the last frame, `confirmed` those of them that several frames
+    have shown, and `prior_horizon` is the row that the ego-lane prior of the last frame gave; each is None if unknown.
+    The prior's row is steadier, because it does not depend on which boundaries are found. If `is_given`, the horizon is known from outside, except for pitch. If it
+    `is_doubtful`, the prior has been uncertain for a while, and the horizon is searched for again.
     """
 
     horizon: float | None = None
     tracked: Curves | None = None
     prior_horizon: float | None = None
     is_given: bool = False
+    is_doubtful: bool = False
+    confirmed: Curves | None = None
 
     @property
     def expected_horizon(self) -> float | None:
@@ -48,6 +51,7 @@ class Detections:
 
     `view` has the horizon that fits them best, `horizon_weight` (0 to 1) is how much the frame reveals about its
     horizon, `prior_horizon` is the row for the next frame's context, and `fit_s` the seconds spent on fitting curves.
+    `uncertainty` is that of the ego-lane prior (`RegressorOutput.uncertainty`).
     """
 
     boundaries: tuple[Detection, ...]
@@ -55,6 +59,7 @@ class Detections:
     horizon_weight: float
     prior_horizon: float | None = None
     fit_s: float = 0.0
+    uncertainty: float = 0.0
 
 
 class Detector(Protocol):

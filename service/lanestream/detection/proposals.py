@@ -57,7 +57,8 @@ class Proposals:
     """The candidates of a frame, best first, in pixels of the working image with these `channels`.
 
     All `curves` (N) share the horizon of `view` and are visible within `spans`. `horizon_weight` (0 to 1) is how much
-    the frame reveals about its horizon; `prior` is the ego-lane prior that guided the search, if any.
+    the frame reveals about its horizon; `prior` is the ego-lane prior that guided the search, and `tracked` are the
+    boundaries of the last frame, if any.
     """
 
     channels: Channels
@@ -66,6 +67,7 @@ class Proposals:
     view: RoadView
     horizon_weight: float
     prior: EgoPrior | None
+    tracked: Curves | None = None
 
 
 def propose(
@@ -117,7 +119,9 @@ def propose(
     every = Curves.concatenate([bright, steps])
     spans = visible_spans(every, view)
     is_tall = spans.visible & (spans.bottom - spans.top >= _SHORTEST * view.depth)
-    usable = np.flatnonzero(is_tall[: len(bright)])
+    was_tracked = np.zeros(len(every), bool)
+    was_tracked[: len(chosen[first])] = chosen[first] >= sum(len(curves) for curves in leading) - len(tracked)
+    usable = np.flatnonzero((is_tall | (was_tracked & is_long(every, spans, view)))[: len(bright)])
     limit = MOST_WITH_TRACKS if len(tracked) else limit
     strongest, others = usable[: limit - most_steps], usable[limit - most_steps :]
     along = len(bright) + np.flatnonzero(is_long(steps, spans.take(slice(len(bright), None)), view))
@@ -125,7 +129,7 @@ def propose(
     is_known = are_duplicates(steps, lines_before, view) | _are_sides(steps, lines_before, view)
     along = along[np.flatnonzero(~is_known.any(axis=1))[:most_steps]]
     kept = np.concatenate([strongest, along, others[: most_steps - len(along)]])
-    return Proposals(channels, every.take(kept), spans.take(kept), view, point.weight, prior)
+    return Proposals(channels, every.take(kept), spans.take(kept), view, point.weight, prior, context.tracked)
 
 
 def is_long(curves: Curves, spans: Spans, view: RoadView) -> NDArray[np.bool_]:

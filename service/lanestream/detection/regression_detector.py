@@ -32,7 +32,9 @@ class RegressionDetector:
 
     def detect(self, image: Image, context: FrameContext, infer: Infer) -> Detections:
         """Returns the ego boundaries in a BGR working image (H, 640, 3) uint8."""
-        output, view = self.regressor.predict(image, context.horizon, infer, is_given=context.is_given)
+        output, view = self.regressor.predict(
+            image, context.horizon, infer, is_given=context.is_given, is_doubtful=context.is_doubtful
+        )
         started = time.perf_counter()
         sides, fits = fit_output(Channels.of(image), output, view, self.regressor.threshold)
         spans = visible_spans(fits.curves, fits.view)
@@ -51,7 +53,7 @@ class RegressionDetector:
             if spans.visible[index]
         ]
         fit_s = time.perf_counter() - started
-        return Detections(tuple(found), fits.view, float(output.presence.max()), None, fit_s)
+        return Detections(tuple(found), fits.view, float(output.presence.max()), None, fit_s, output.uncertainty)
 
 
 def fit_output(

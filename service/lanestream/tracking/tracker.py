@@ -104,6 +104,11 @@ class LaneTracker:
 
     @property
     def curves(self) -> Curves | None:
+        """The boundaries in the last frame, confirmed or not; None before the first frame."""
+        return None if self._road is None else self._road.curves()
+
+    @property
+    def confirmed_curves(self) -> Curves | None:
         """The confirmed boundaries in the last frame; None before the first frame."""
         if self._road is None:
             return None

@@ -36,6 +36,7 @@ class ScriptedDetector(fakes.FakeDetector):
 
     horizons: list[tuple[float, float]]  # of each frame: the row as a share of the height, and its weight
     prior_horizon: float | None = None
+    uncertainty: float = 0.0
     contexts: list[FrameContext] = field(default_factory=list)
     sizes: list[tuple[int, int]] = field(default_factory=list)
 
@@ -44,7 +45,7 @@ class ScriptedDetector(fakes.FakeDetector):
         self.sizes.append(image.shape[:2])
         share, weight = self.horizons.pop(0)
         found = super().detect(image, FrameContext(share * len(image)), infer)
-        return replace(found, horizon_weight=weight, prior_horizon=self.prior_horizon)
+        return replace(found, horizon_weight=weight, prior_horizon=self.prior_horizon, uncertainty=self.uncertainty)
 
 
 def test_a_detector_gets_a_working_image_of_640_columns() -> None:
@@ -104,6 +105,38 @@ def test_the_horizon_is_smoothed_and_follows_slowly() -> None:
     assert shares[:3] == pytest.approx([0.4, 0.45, 0.45]), "the mean so far; a frame without a weight says nothing"
     assert shares[-1] == pytest.approx(0.5, abs=0.01)
     assert all(later >= earlier for earlier, later in pairwise(shares))
+
+
+def test_an_uncertain_horizon_becomes_doubtful_after_a_second() -> None:
+    detector = ScriptedDetector([(0.4, 1.0)] * 60, uncertainty=0.2)
+    session = Session(detector)
+    for i in range(60):
+        session.process(fakes.picture(640, 360), 0.04 * i, infer)
+    doubtful = [i for i, context in enumerate(detector.contexts) if context.is_doubtful]
+    assert doubtful == pytest.approx([26, 52], abs=1), "once a second, not in every frame"
+    for detector in (ScriptedDetector([(0.4, 1.0)] * 60), ScriptedDetector([(0.4, 1.0)] * 60, uncertainty=0.2)):
+        options = SessionOptions(horizon=0.4 if detector.uncertainty else None)
+        session = Session(detector, options)
+        for i in range(60):
+            session.process(fakes.picture(640, 360), 0.04 * i, infer)
+        assert not any(context.is_doubtful for context in detector.contexts), "certain, or configured"
+
+
+@pytest.mark.parametrize(("row", "counts_at_once"), [(0.3, True), (0.42, False)])
+def test_a_horizon_that_a_search_finds_elsewhere_counts_at_once(row: float, counts_at_once: bool) -> None:
+    detector = ScriptedDetector([(0.4, 1.0)] * 40, uncertainty=0.2)
+    session = Session(detector)
+    while not (detector.contexts and detector.contexts[-1].is_doubtful):
+        frame = len(detector.contexts)
+        if session.state.uncertain_s >= 1.0:
+            detector.horizons[0] = (row, 1.0)
+        session.process(fakes.picture(640, 360), 0.04 * frame, infer)
+    assert session.state.horizon == pytest.approx(row if counts_at_once else 0.4, abs=0.003)
+    state = session.state
+    state.validate()
+    restored = Session(detector)
+    restored.restore(state)
+    assert restored.state == state
 
 
 def test_another_size_resets_the_tracker() -> None:

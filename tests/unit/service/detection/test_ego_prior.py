@@ -213,11 +213,19 @@ def test_tracked_boundaries_come_after_those_of_the_prior_and_before_lines() -> 
     assert place >= len(prior.sides)
 
 
-@pytest.mark.parametrize(("presence", "expected"), [((0.3, 0.49), 0.0), ((0.1, 0.5), 1.0)])
+@pytest.mark.parametrize(
+    ("presence", "is_tracking", "expected"),
+    [
+        ((0.3, 0.49), False, 0.0),
+        ((0.1, 0.5), False, 1.0),
+        ((0.1, 0.26), True, 1.0),
+        ((0.1, 0.24), True, 0.0),
+    ],
+)
 def test_a_frame_in_which_neither_ego_boundary_is_likely_has_no_boundaries(
-    presence: tuple[float, float], expected: float
+    presence: tuple[float, float], is_tracking: bool, expected: float
 ) -> None:
     output = RegressorOutput(np.full((2, 3), 0.1), np.full((2, 3), 0.01), np.array(presence), 0.0, np.zeros(2))
-    prior = RoadRegressor(0.6).prior(output, VIEW)
+    prior = RoadRegressor(0.6).prior(output, VIEW, is_tracking=is_tracking)
     assert prior.sides == ()
     np.testing.assert_array_equal(prior.odds(lines(-1.0, 0.4)), np.full((2, 2), expected))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -137,19 +137,58 @@ def test_boundaries_are_reported_from_the_threshold_on() -> None:
     assert detections.horizon_weight == pytest.approx(0.9)
 
 
+def looks_at(views: Sequence[RoadView], sigmas: Sequence[float], horizon: float = 0.02) -> Outputs:
+    """Returns the outputs for the crops at `views`: the horizon is a little lower, and the uncertainty is `sigmas`."""
+    outputs = np.stack([output_for(view, horizon=horizon) for view in views])
+    outputs[:, 6:12] = np.array(sigmas)[:, None]
+    return outputs
+
+
+SEARCHED = [VIEW.with_horizon(share * HEIGHT) for share in UNKNOWN_HORIZONS]
+
+
 def test_an_unknown_horizon_is_looked_for_at_several_rows_and_then_where_it_was_seen() -> None:
-    views = [VIEW.with_horizon(share * HEIGHT) for share in UNKNOWN_HORIZONS]
-    looks = np.stack([output_for(view, horizon=0.02) for view in views])
-    looks[:, 6:12] = 0.05
-    looks[1, 6:12] = 0.005
+    looks = looks_at(SEARCHED, [0.05, 0.005, *[0.05] * 6])
     infer = FakeRegressor(output_for(VIEW), looks)
     _, view = REGRESSOR.predict(ROAD, None, infer)
-    assert [len(inputs) for inputs in infer.inputs] == [len(UNKNOWN_HORIZONS), 1]
-    assert view.horizon == pytest.approx(views[1].horizon + 0.02 * views[1].depth, abs=1.0)
+    assert [len(inputs) for inputs in infer.inputs] == [len(UNKNOWN_HORIZONS), 1, 1]
+    assert view.horizon == pytest.approx(SEARCHED[1].horizon + 0.02 * SEARCHED[1].depth, abs=1.0)
     assert len(set(map(bytes, infer.inputs[0]))) == len(UNKNOWN_HORIZONS), "the crops differ"
     known = FakeRegressor(output_for(VIEW))
     REGRESSOR.predict(ROAD, HORIZON, known)
     assert [len(inputs) for inputs in known.inputs] == [1], "one look is enough for a known horizon"
+
+
+def test_a_horizon_that_was_found_is_refined_until_it_hardly_moves() -> None:
+    infer = FakeRegressor(output_for(VIEW, horizon=0.05), looks_at(SEARCHED, [0.05, 0.005, *[0.05] * 6]))
+    _, view = REGRESSOR.predict(ROAD, None, infer)
+    assert len(infer.inputs) == 1 + 3 + 1, "it always moves"
+    row = SEARCHED[1].horizon + 0.02 * SEARCHED[1].depth
+    for _ in range(4):
+        row += 0.05 * (HEIGHT - 1.0 - row)
+    assert view.horizon == pytest.approx(row, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "presence", "found"),
+    [(0.03, 0.9, True), (0.045, 0.9, False), (0.03, 0.3, False)],
+    ids=["clearly another row", "another row, not clearly", "no road there"],
+)
+def test_a_doubtful_horizon_competes_with_a_search(sigmas: float, presence: float, found: bool) -> None:
+    views = [VIEW, *SEARCHED]
+    looks = looks_at(views, [0.05, 0.08, sigmas, *[0.08] * 6], horizon=0.0)
+    looks[2, 12:14] = presence
+    infer = FakeRegressor(output_for(VIEW), looks)
+    _, view = REGRESSOR.predict(ROAD, HORIZON, infer, is_doubtful=True)
+    assert len(infer.inputs[0]) == len(views)
+    assert view.horizon == pytest.approx(SEARCHED[1].horizon if found else HORIZON, abs=1.0)
+
+
+def test_a_given_horizon_is_never_searched_for() -> None:
+    infer = FakeRegressor(output_for(VIEW, horizon=0.3))
+    _, view = REGRESSOR.predict(ROAD, HORIZON, infer, is_given=True, is_doubtful=True)
+    assert [len(inputs) for inputs in infer.inputs] == [1]
+    assert view.horizon == pytest.approx(HORIZON + 0.05 * VIEW.depth)
 
 
 def test_of_equally_certain_looks_the_one_counts_that_sees_the_horizon_where_it_is() -> None:
@@ -280,6 +319,6 @@ def test_the_horizon_that_the_prior_saw_is_kept_for_the_next_frame() -> None:
 
     first = CANDIDATES.detect(ROAD, FrameContext(HORIZON), with_classifier)
     assert first.prior_horizon == pytest.approx(HORIZON + 0.05 * VIEW.depth)
-    CANDIDATES.detect(ROAD, FrameContext(HORIZON + 90.0, None, HORIZON), with_classifier)
+    CANDIDATES.detect(ROAD, FrameContext(HORIZON + 90.0, prior_horizon=HORIZON), with_classifier)
     np.testing.assert_array_equal(infer.inputs[0], infer.inputs[1], "the prior's horizon is preferred")
     assert min(patches) >= 2

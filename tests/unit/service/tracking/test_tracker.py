@@ -529,14 +529,15 @@ def test_innovations_are_reported_for_known_boundaries_only() -> None:
     assert (tracker.nis < 1.0).all()
 
 
-def test_tracked_curves_are_those_of_confirmed_boundaries() -> None:
+def test_tracked_curves_include_those_of_boundaries_that_are_not_yet_confirmed() -> None:
     tracker = LaneTracker()
-    assert tracker.curves is None
+    assert (tracker.curves, tracker.confirmed_curves) == (None, None)
     result = drive(tracker, 10, lambda _: road(0.0, (0, 1)))[-1]
     tracker.update([*road(0.0, (0, 1)), detection(3.5)], 10 * DT, VIEW)
     assert tracker.curves is not None
-    assert len(tracker.curves) == 2
-    columns = sorted(float(x) for x in tracker.curves.x(np.array([VIEW.bottom]))[:, 0])
+    assert tracker.confirmed_curves is not None
+    assert len(tracker.curves) == 3
+    columns = sorted(float(x) for x in tracker.confirmed_curves.x(np.array([VIEW.bottom]))[:, 0])
     assert columns == pytest.approx(bottom_columns(result), abs=1.0)
     tracker.update([], 90.0, VIEW)
     assert tracker.curves is not None
