@@ -28,8 +28,9 @@ class FrameContext:
 
     `horizon` is its row, `tracked` are the boundaries of the last frame, `confirmed` those of them that several frames
     have shown, and `prior_horizon` is the row that the ego-lane prior of the last frame gave; each is None if unknown.
-    The prior's row is steadier, because it does not depend on which boundaries are found. If `is_given`, the horizon is known from outside, except for pitch. If it
-    `is_doubtful`, the prior has been uncertain for a while, and the horizon is searched for again.
+    The prior's row is steadier, because it does not depend on which boundaries are found. If `is_given`, the horizon is
+    known from outside, except for pitch. If it `is_doubtful`, the prior has been uncertain for a while, and the horizon
+    is searched for again.
     """
 
     horizon: float | None = None

@@ -72,7 +72,7 @@ def test_the_road_ends_at_its_edge() -> None:
     assert list(accepted(detections, Acceptance())) == [1.2, 3.4]
     marking = [*detections[:1], found(3.4, 0.95), detections[2]]
     assert list(accepted(marking, Acceptance())) == [1.2, 3.4, 5.6], "beyond a marking the road goes on"
-    assert accepted(marking, Acceptance())[5.6] == 0.9, "the probability of the decision itself"
+    assert accepted(marking, Acceptance())[5.6] == pytest.approx(0.9)
 
 
 def test_the_shipped_acceptance_is_monotonic_and_stricter_than_the_decisions() -> None:

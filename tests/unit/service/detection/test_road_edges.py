@@ -132,8 +132,8 @@ def test_edges_below_a_horizon_above_the_picture_are_candidates(beside: tuple[in
 def test_a_tracked_edge_that_is_nearly_level_in_the_image_stays_a_candidate() -> None:
     """The far edge of a wide road crosses few rows, but is long."""
     plain = roads.channels(np.full((360, 640), 100, np.uint8))
-    context = FrameContext(VIEW.horizon, Curves.of([roads.straight(VIEW, 14.0)]))
-    assert distances(propose(plain, context, None, None), 14.0).min() < CLOSE
+    context = FrameContext(VIEW.horizon, Curves.of([roads.straight(VIEW, 8.0)]))
+    assert distances(propose(plain, context, None, None), 8.0).min() < CLOSE
 
 
 # --- Boundaries -----------------------------------------------------------------------------------------------------
