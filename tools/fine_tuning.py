@@ -97,7 +97,7 @@ def evaluated(data: Path, classifier: Path, regressor: Path, file: Path) -> dict
     """Returns the figures of the validation drives of all data sets."""
     if not file.exists():
         models = "--model", classifier, "--regressor", regressor
-        lanestream("evaluate", *models, "--data", data, "--split", "val", "--no-road", "0", "--json", file)
+        lanestream("evaluate", *models, "--data", data, "--split", "val", "--labels-only", "--json", file)
     figures: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return figures
 

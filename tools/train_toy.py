@@ -58,7 +58,7 @@ def main(folder: Path) -> None:
     )
     report = folder / "evaluation.json"
     evaluated = "--model", model, "--regressor", "none", "--data", folder / "test"
-    lanestream("evaluate", *evaluated, "--no-road", "0", "--json", report)
+    lanestream("evaluate", *evaluated, "--labels-only", "--json", report)
     answer = detect_lanes(model, folder / "test" / "thursday" / "0000.jpg", folder / "service.log")
     (folder / "answer.json").write_text(json.dumps(answer, indent=2) + "\n", encoding="utf-8")
     print(f"the service found {len(answer['lanes'])} boundaries; {time.monotonic() - started:.0f} s in all")

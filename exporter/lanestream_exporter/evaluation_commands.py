@@ -19,7 +19,7 @@ from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
-from lanestream_exporter.evaluation.measuring import EvaluationSet, run_evaluation
+from lanestream_exporter.evaluation.measuring import NO_EXTRAS, USUAL_EXTRAS, EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
 from lanestream_exporter.evaluation.score import score_results
 from lanestream_exporter.evaluation.tables import figure_tables
@@ -65,8 +65,8 @@ _MIN_TRACKING_WIDTH: Final = 150
     "--format", "format_name", type=click.Choice([AUTO, *FORMATS]), default=AUTO, help="The format of your labels."
 )
 @click.option(
-    "--no-road", type=click.IntRange(0), default=200, show_default=True, metavar="PICTURES",
-    help="Random pictures without a road to evaluate on, too.",
+    "--labels-only", is_flag=True,
+    help="Leave out the pictures without a road, the rendered towns and the stills.",
 )  # fmt: skip
 @click.pass_context
 def evaluate(
@@ -79,13 +79,13 @@ def evaluate(
     data: Path | None,
     manifest: Path | None,
     format_name: str,
-    no_road: int,
+    labels_only: bool,
 ) -> None:
     """Evaluate model files and two classical baselines on labeled frames.
 
-    Figures are for candidates (level A), boundaries of single images and of clips (B), the field's metrics (C), and
-    pictures without a road; docs/evaluation.md describes each. A folder of labeled frames given with --data is
-    evaluated as single images.
+    Figures are for candidates (level A), boundaries of single images and of clips (B), the field's metrics (C),
+    pictures without a road, rendered towns, and stills; docs/evaluation.md describes each. A folder of labeled frames
+    given with --data is evaluated as single images.
     """
     if context.invoked_subcommand is not None:
         _refuse_options(context)
@@ -96,7 +96,7 @@ def evaluate(
         _methods(models, regressor),
         evaluation_set,
         lambda stage: click.echo(f"measuring {stage} ...", err=True),
-        no_road,
+        NO_EXTRAS if labels_only else USUAL_EXTRAS,
     )
     figures = evaluation.figures()
     console = Console(width=max(_MIN_WIDTH, Console().width))

@@ -33,6 +33,7 @@ class ReportedBoundary:
 
     `farthest` is the highest row that it may be extrapolated to; None allows extrapolation close to its horizon. `type`
     and `color` are those of a marking; None for an edge of the road, and from a method that does not classify markings.
+    `probability` is that of being a boundary; None from a method without probabilities.
     """
 
     curve: Curve
@@ -44,6 +45,7 @@ class ReportedBoundary:
     kind: BoundaryKind = "marking"
     type: str | None = None
     color: str | None = None
+    probability: float | None = None
 
     @classmethod
     def from_lane(cls, lane: LaneBoundary) -> ReportedBoundary:
@@ -51,7 +53,15 @@ class ReportedBoundary:
         kind = lane.appearance.kind
         marking_type, color = _painted(lane.appearance) if kind == "marking" else (None, None)
         return cls(
-            lane.curve, lane.top, lane.bottom, lane.position, lane.track_id, kind=kind, type=marking_type, color=color
+            lane.curve,
+            lane.top,
+            lane.bottom,
+            lane.position,
+            lane.track_id,
+            kind=kind,
+            type=marking_type,
+            color=color,
+            probability=lane.probability,
         )
 
     def straight_columns(self, rows: FloatArray) -> FloatArray:

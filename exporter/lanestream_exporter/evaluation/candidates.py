@@ -54,7 +54,7 @@ def _judged(
         "base_rate": round(float(truth.mean()), 4) if len(truth) else None,
         **point_estimates(counts, frames, _rates),
         "average_precision": round(float(average_precision_score(truth, probability)), 4) if both else None,
-        "calibration": _calibration(truth, probability),
+        "calibration": calibration(truth, probability),
         "intervals": intervals(counts, frames, _rates),
     }
 
@@ -69,10 +69,10 @@ def _rates(counts: FloatArray) -> dict[str, FloatArray]:
     }
 
 
-def _calibration(truth: NDArray[np.bool_], probability: FloatArray) -> dict[str, Any]:
+def calibration(truth: NDArray[np.bool_], probability: FloatArray) -> dict[str, Any]:
     """Returns ten bins of equal width, and the expected calibration error: their gaps weighted by their counts.
 
-    After C. Guo et al., "On calibration of modern neural networks", 2017, for the probability of being true.
+    After C. Guo et al., "On calibration of modern neural networks", 2017, for the probability (N,) of being true, `truth` (N,).
     """
     bin_of = np.minimum((probability * _BINS).astype(int), _BINS - 1)
     bins, error = [], 0.0

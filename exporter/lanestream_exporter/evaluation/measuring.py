@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -23,7 +23,10 @@ from lanestream_exporter.evaluation.lateral import lateral_figures
 from lanestream_exporter.evaluation.methods import Method
 from lanestream_exporter.evaluation.no_road import NoRoadOutcome, by_kind, no_road_figures, run_no_road
 from lanestream_exporter.evaluation.outcomes import FrameEvaluation
+from lanestream_exporter.evaluation.reliability import reliability_figures
 from lanestream_exporter.evaluation.steadiness import steadiness
+from lanestream_exporter.evaluation.stills import StillOutcome, by_source, run_stills, still_figures
+from lanestream_exporter.evaluation.towns import run_towns, town_figures
 from lanestream_exporter.evaluation.verdicts import verdicts
 
 SCHEMA = 3
@@ -69,13 +72,17 @@ class ClipRun:
 
 @dataclass
 class Evaluation:
-    """The outcomes of every method: on images and on pictures without a road by method, on clips by method and clip."""
+    """The outcomes of every method: by method on images, pictures without a road, towns and stills, on clips by method
+    and clip.
+    """
 
     evaluation_set: EvaluationSet
     methods: tuple[Method, ...]
     images: dict[str, list[FrameEvaluation]]
     clips: dict[str, dict[str, ClipRun]]
     no_road: dict[str, list[NoRoadOutcome]]
+    towns: dict[str, list[FrameEvaluation]]
+    stills: dict[str, list[StillOutcome]]
 
     def figures(self) -> dict[str, Any]:
         """Returns all figures as written to the JSON file; docs/evaluation.md documents every key."""
@@ -88,6 +95,8 @@ class Evaluation:
             "conditions": {name: _part_figures(by_condition(outcomes)) for name, outcomes in self.images.items()},
             "clips": {method.name: self._clip_figures(method) for method in self.methods},
             "no_road": {name: _no_road_figures(outcomes) for name, outcomes in self.no_road.items()},
+            "towns": {name: town_figures(outcomes) if outcomes else {} for name, outcomes in self.towns.items()},
+            "stills": {name: _still_figures(outcomes) for name, outcomes in self.stills.items()},
         }
         return {**figures, "verdicts": verdicts(figures)}
 
@@ -105,11 +114,25 @@ class Evaluation:
         return {**figures, OVERALL: _clip_groups(tracked, alone)}
 
 
+@dataclass(frozen=True)
+class Extras:
+    """How many random pictures without a road, rendered towns, and stills are evaluated besides the labeled frames."""
+
+    no_road: int = 0
+    towns: int = 0
+    stills: int = 0
+
+
+NO_EXTRAS: Final = Extras()
+USUAL_EXTRAS: Final = Extras(no_road=200, towns=100, stills=100)
+
+
 def image_figures(method: Method, outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns all figure groups of a method on single images. A new group is one more entry here."""
     figures: dict[str, Any] = {
         "boundaries": boundary_figures(outcomes),
         "kinds": kind_figures(outcomes),
+        "reliability": reliability_figures(outcomes),
         "lateral": lateral_figures(outcomes),
         "field": field_figures(outcomes),
     }
@@ -154,6 +177,12 @@ def _no_road_figures(outcomes: Sequence[NoRoadOutcome]) -> dict[str, Any]:
     return {kind: no_road_figures(part) for kind, part in {**by_kind(outcomes), OVERALL: outcomes}.items()}
 
 
+def _still_figures(outcomes: Sequence[StillOutcome]) -> dict[str, Any]:
+    if not outcomes:
+        return {}
+    return {source: still_figures(part) for source, part in {**by_source(outcomes), OVERALL: outcomes}.items()}
+
+
 def _clip_groups(tracked: Sequence[FrameEvaluation], alone: Sequence[FrameEvaluation]) -> dict[str, Any]:
     return {
         "tracked": boundary_figures(tracked),
@@ -166,9 +195,9 @@ def run_evaluation(
     methods: Sequence[Method],
     evaluation_set: EvaluationSet,
     report: Callable[[str], None] = lambda _: None,
-    no_road: int = 0,
+    extras: Extras = NO_EXTRAS,
 ) -> Evaluation:
-    """Runs every method on every frame of `evaluation_set`, and on `no_road` pictures without a road.
+    """Runs every method on every frame of `evaluation_set`, and on the `extras`.
 
     `report` is called with the name of each stage.
 
@@ -184,11 +213,21 @@ def run_evaluation(
         report(clip.name)
         for name, run in _track(methods, clip).items():
             clips[name][clip.name] = run
-    if methods and not images[methods[0].name] and not evaluation_set.clips:
+    first = images[methods[0].name] if methods else []
+    if methods and not first and not evaluation_set.clips:
         raise LabelError(f"{evaluation_set.name} has no labeled frames", "give labeled images")
-    if no_road:
+    if extras.no_road:
         report("pictures without a road")
-    return Evaluation(evaluation_set, tuple(methods), images, clips, run_no_road(methods, no_road))
+    no_road = run_no_road(methods, extras.no_road)
+    if extras.towns:
+        report("rendered towns")
+    towns = run_towns(methods, extras.towns)
+    stills: dict[str, list[StillOutcome]] = {}
+    if extras.stills:
+        report("stills")
+        frames = [outcome.frame for outcome in first]
+        stills = run_stills(methods, evaluation_set.images(), frames, extras.stills)
+    return Evaluation(evaluation_set, tuple(methods), images, clips, no_road, towns, stills)
 
 
 def _track(methods: Sequence[Method], clip: LabeledClip) -> dict[str, ClipRun]:

@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +72,13 @@ class Chart:
 
 
 def charts(evaluation: Evaluation, figures: Mapping[str, Any]) -> list[Chart]:
-    """Draws all charts: those of level A for every classifier, then the error by depth of all methods."""
+    """Draws all charts: those of level A and of reliability by method, then the error by depth of all methods."""
     images = figures["images"]
     result: list[Chart] = []
     for method in evaluation.methods:
         if method.threshold is not None:
             result += _candidate_charts(method.name, evaluation.images[method.name], images[method.name])
+        result += _reliability_charts(method.name, figures)
     caption = "Error of the right ego boundaries by depth, single images, all drives"
     return [*result, _chart(caption, lambda axes: _draw_depth(axes, images))]
 
@@ -95,6 +97,22 @@ def _candidate_charts(name: str, outcomes: Sequence[FrameEvaluation], drives: Ma
     yield _chart(f"{name}: proposal recall by number of candidates", lambda axes: _draw_proposals(axes, drives))
 
 
+def _reliability_charts(name: str, figures: Mapping[str, Any]) -> Iterator[Chart]:
+    parts = {"single images": figures["images"][name][OVERALL], "rendered towns": figures["towns"][name]}
+    for where, part in parts.items():
+        roles = part["reliability"] if part else {}
+        if roles:
+            caption = f"{name}: reliability of reported boundaries, {where}, with the count of each bin"
+            yield _chart(caption, partial(_draw_roles, roles=roles))
+
+
+def _draw_roles(axes: Axes, roles: Mapping[str, Any]) -> None:
+    for role, part in roles.items():
+        _draw_reliability(axes, part["calibration"]["bins"], role)
+    axes.set(ylabel="share of right reports")
+    axes.legend(fontsize=7)
+
+
 def _draw_curves(axes: Axes, outcomes: Sequence[FrameEvaluation]) -> None:
     for drive, part in by_drive(outcomes).items():
         truth, probability = clear_candidates(part, CHART_RULE)
@@ -110,10 +128,10 @@ def _draw_confusion(axes: Axes, counts: Mapping[str, int]) -> None:
     axes.set(xlabel="classifier", ylabel="label")
 
 
-def _draw_reliability(axes: Axes, bins: Sequence[Mapping[str, Any]]) -> None:
+def _draw_reliability(axes: Axes, bins: Sequence[Mapping[str, Any]], label: str | None = None) -> None:
     axes.plot([0.0, 1.0], [0.0, 1.0], color="0.7", linewidth=1.0)
     points = [(b["mean_probability"], b["true_share"], b["count"]) for b in bins if b["count"]]
-    axes.plot([predicted for predicted, _, _ in points], [true for _, true, _ in points], marker="o")
+    axes.plot([predicted for predicted, _, _ in points], [true for _, true, _ in points], marker="o", label=label)
     for predicted, true, count in points:
         axes.annotate(str(count), (predicted, true), (4, -10), textcoords="offset points")
     axes.set(xlabel="mean probability", ylabel="share of true candidates", xlim=(0.0, 1.05), ylim=(0.0, 1.05))

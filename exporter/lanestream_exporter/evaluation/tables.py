@@ -21,6 +21,8 @@ _DECISIONS = (*_CANDIDATES, "ego prop.", "all prop.")
 _BOUNDARIES = ("frames", "right", "wrong", "missed", "ego base", "ego P", "ego R", "px", "all P", "all R", "all F1")
 _KINDS = ("marked", "of", "edge P", "edge R", "type", "of", "constant", "color", "of", "constant")
 _NO_ROAD = ("pictures", "boundary", "marking", "ego lane", "share")
+_STILLS = ("stills", "with a loss", "boundaries", "lost", "gained")
+_TRADE = ("right", "wrong", "precision", "recall")
 _KINDS_TITLE = "Frames without markings in which one is reported, edges of the road, types and colors"
 _LITTLE = f"* says little: more than {HIGH_BASE_RATE:.0%} of what is judged are boundaries (base rate)"
 
@@ -38,6 +40,13 @@ def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     if any(no_road.values()):
         overall = {method: {"overall": kinds["overall"]} for method, kinds in no_road.items()}
         yield _table("Pictures without a road in which something is reported", _NO_ROAD, overall, _no_road)
+    if any(figures["towns"].values()):
+        towns = {method: {"all": part} for method, part in figures["towns"].items()}
+        yield _table("Boundaries in rendered towns, single images", _BOUNDARIES, towns, _on_images)
+    if any(figures["stills"].values()):
+        stills = figures["stills"]
+        yield _table("Boundaries that a stream of one picture loses", _STILLS, stills, _stills)
+    yield from _trades(figures)
     yield _table("A. Candidates, by the classifier's probability: false beyond 40 px", _CANDIDATES, images, _candidates)
     yield _table("A. Candidates, by the detector's decision, and proposal recall with 16", _DECISIONS, images, _decided)
     yield _table("B. Single images: boundaries, error in px at 640 wide", _BOUNDARIES, images, _on_images)
@@ -51,6 +60,22 @@ def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
     yield _table(
         "C. Benchmark metrics of the ego pair only", _BENCHMARKS, images, lambda groups: _field(groups["field"]["ego"])
     )
+
+
+def _trades(figures: Mapping[str, Any]) -> Iterator[Table]:
+    """Yields precision and recall from each probability on, of the first method, for the ego pair and outer ones."""
+    first = next(iter(figures["images"]))
+    parts = {"single images": figures["images"][first]["overall"], "rendered towns": figures["towns"][first]}
+    for name, part in parts.items():
+        roles = part["reliability"] if part else {}
+        if roles:
+            title = f"{first}: boundaries from a probability on, {name}"
+            rows = {role: {str(row["least"]): row for row in of_role["trade"]} for role, of_role in roles.items()}
+            by_least = {least: {role: rows[role][least] for role in rows} for least in rows["ego"]}
+            table = _empty(title, [f"{role} {column}" for role in rows for column in _TRADE])
+            for least, by_role in by_least.items():
+                table.add_row(least, *(_cell(row[column]) for row in by_role.values() for column in _TRADE))
+            yield table
 
 
 def _tracked_kinds(groups: Mapping[str, Any]) -> list[float | str | None]:
@@ -69,6 +94,10 @@ def _kinds(kinds: Mapping[str, Any]) -> list[float | str | None]:
 
 def _no_road(part: Mapping[str, Any]) -> list[float | str | None]:
     return [part[key] for key in ("pictures", "with_boundary", "with_marking", "with_ego_lane", "share")]
+
+
+def _stills(part: Mapping[str, Any]) -> list[float | str | None]:
+    return [part[key] for key in ("stills", "with_loss", "boundaries", "lost", "gained")]
 
 
 def _candidates(groups: Mapping[str, Any]) -> list[float | str | None]:
@@ -117,10 +146,7 @@ def _field(part: Mapping[str, Any]) -> list[float | str | None]:
 
 
 def _table(title: str, columns: Sequence[str], methods: Mapping[str, Any], cells: RowCells) -> Table:
-    table = Table(title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("")
-    for column in columns:
-        table.add_column(column, justify="right")
+    table = _empty(title, columns)
     for drive in next(iter(methods.values())):
         rows = [(method, cells(drives[drive])) for method, drives in methods.items()]
         if any(row for _, row in rows):
@@ -130,6 +156,14 @@ def _table(title: str, columns: Sequence[str], methods: Mapping[str, Any], cells
                 table.add_row(Text(f" {method}"), *map(_cell, row))
                 if any(isinstance(cell, str) and cell.endswith("*") for cell in row):
                     table.caption = _LITTLE
+    return table
+
+
+def _empty(title: str, columns: Sequence[str]) -> Table:
+    table = Table(title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("")
+    for column in columns:
+        table.add_column(column, justify="right")
     return table
 
 

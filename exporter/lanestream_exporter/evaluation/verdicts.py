@@ -8,6 +8,9 @@ from typing import Any, Final
 # If more than this share of what is judged is a boundary, precision hardly measures false reports.
 HIGH_BASE_RATE: Final = 0.9
 
+# The probability from which a report counts as certain.
+CERTAIN: Final = 0.9
+
 Groups = Mapping[str, Any]
 
 
@@ -25,6 +28,9 @@ def verdicts(figures: Groups) -> list[str]:
         whole = clips["overall"]
         lines.append(f"clips with the tracker: {_boundaries(whole['tracked'])}{_looks(whole['kinds']['tracked'])}")
     lines += _no_road(figures["no_road"][first])
+    lines += _towns(figures["towns"][first])
+    lines += _stills(figures["stills"].get(first, {}))
+    lines += _reliability(figures["images"][first]["overall"]["reliability"], "single images")
     return [*lines, *_warnings(figures["images"][first]["overall"], figures["datasets"][first])]
 
 
@@ -101,6 +107,33 @@ def _no_road(kinds: Groups) -> Iterator[str]:
             f"pictures without a road: a boundary reported in {part['with_boundary']} of {part['pictures']}, a marking "
             f"in {part['with_marking']}, both ego boundaries in {part['with_ego_lane']}"
         )
+
+
+def _towns(part: Groups) -> Iterator[str]:
+    if part:
+        yield f"rendered towns: {_boundaries(part['boundaries'])}"
+        yield from _reliability(part["reliability"], "rendered towns")
+
+
+def _stills(sources: Groups) -> Iterator[str]:
+    if sources:
+        part = sources["overall"]
+        yield (
+            f"stills: a stream of one picture loses a boundary in {part['with_loss']} of {part['stills']}, "
+            f"{part['lost']} of {part['boundaries']} boundaries"
+        )
+
+
+def _reliability(roles: Groups, where: str) -> Iterator[str]:
+    """Yields how much of what is reported with a probability of at least 0.9 is right."""
+    parts = []
+    for role, part in roles.items():
+        row = next(row for row in part["trade"] if row["least"] == CERTAIN)
+        if row["precision"] is not None:
+            reported = row["right"] + row["wrong"]
+            parts.append(f"{row['right']} of {reported} {role} boundaries right ({_percent(row['precision'])})")
+    if parts:
+        yield f"{where}, what is reported with a probability of at least {CERTAIN}: {', '.join(parts)}"
 
 
 def _warnings(overall: Groups, datasets: Groups) -> Iterator[str]:

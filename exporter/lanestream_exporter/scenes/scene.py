@@ -28,6 +28,8 @@ from lanestream_exporter.scenes.surroundings_sampling import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from lanestream_exporter.scenes.backdrop import Backdrop
     from lanestream_exporter.scenes.kerbs import Kerb
     from lanestream_exporter.scenes.markings import Paintwork
@@ -105,10 +107,12 @@ class Weather:
     fog: float  # visibility in meters, or infinity
 
 
-def sample_scene(rng: np.random.Generator, width: int, height: int) -> Scene:
-    """Samples a scene for a still of the given size in pixels."""
+def sample_scene(
+    rng: np.random.Generator, width: int, height: int, styles: Mapping[RoadStyle, float] = STYLES
+) -> Scene:
+    """Samples a scene for a still of the given size in pixels, on a road of one of the `styles` by their weights."""
     sampler = RandomSampler(rng)
-    style = sampler.weighted_choice(STYLES)
+    style = sampler.weighted_choice(styles)
     scene = compose_scene(sampler, (width, height), style, sample_weather(sampler), STILL_LENGTH)
     if sampler.bernoulli(QUEUE_SHARES.get(style, 0.0)):
         elsewhere = tuple(car for car in scene.traffic if all(abs(car.u - lane) > 1.5 for lane in scene.road.lanes))
