@@ -72,7 +72,7 @@ def _rates(counts: FloatArray) -> dict[str, FloatArray]:
 def calibration(truth: NDArray[np.bool_], probability: FloatArray) -> dict[str, Any]:
     """Returns ten bins of equal width, and the expected calibration error: their gaps weighted by their counts.
 
-    After C. Guo et al., "On calibration of modern neural networks", 2017, for the probability (N,) of being true, `truth` (N,).
+    After C. Guo et al., "On calibration of modern neural networks", 2017, for the `probability` (N,) of being true.
     """
     bin_of = np.minimum((probability * _BINS).astype(int), _BINS - 1)
     bins, error = [], 0.0

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.evaluation.boundaries import ego_labels
+from lanestream_exporter.datasets.labels import LabeledLane
+from lanestream_exporter.evaluation.boundaries import ReportedBoundary, ego_labels
 from lanestream_exporter.evaluation.candidates import calibration
 from lanestream_exporter.evaluation.figures import match_all
 from lanestream_exporter.evaluation.outcomes import FrameEvaluation
@@ -29,27 +30,36 @@ def reliability_figures(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
 
     Methods that report no probabilities have none.
     """
-    if any(report.probability is None for outcome in outcomes for report in outcome.reports):
+    if not outcomes or any(report.probability is None for outcome in outcomes for report in outcome.reports):
         return {}
     return {role: _figures(outcomes, role) for role in ROLES}
 
 
+def judged_reports(outcome: FrameEvaluation, role: Role) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Returns which of the reports of a role are right (N,), and their probabilities (N,)."""
+    matched = match_all(outcome)
+    right = {found.index for found in matched.matches}
+    judged = [i for i in sorted(right.union(matched.wrong_reports)) if _role(outcome.reports[i]) == role]
+    return np.array([i in right for i in judged], bool), _probabilities(outcome)[judged]
+
+
 def _figures(outcomes: Sequence[FrameEvaluation], role: Role) -> dict[str, Any]:
-    judged = [_judged(outcome, role) for outcome in outcomes]
-    is_right = np.concatenate([right for right, _, _ in judged]) if judged else np.zeros(0, bool)
-    probability = np.concatenate([values for _, values, _ in judged]) if judged else np.zeros(0)
-    labels = sum(number for _, _, number in judged)
+    judged = [judged_reports(outcome, role) for outcome in outcomes]
+    is_right, probability = (np.concatenate(parts) for parts in zip(*judged, strict=True))
+    found = np.concatenate([_found_labels(outcome, role) for outcome in outcomes])
+    labels = sum(len(_labels(outcome, role)) for outcome in outcomes)
     trade = []
     for least in LEAST:
         chosen = is_right[probability >= least]
-        right, reported = int(chosen.sum()), len(chosen)
+        right, reported, reached = int(chosen.sum()), len(chosen), int((found >= least).sum())
         trade.append(
             {
                 "least": least,
                 "right": right,
                 "wrong": reported - right,
                 "precision": round(right / reported, 4) if reported else None,
-                "recall": round(right / labels, 4) if labels else None,
+                "found": reached,
+                "recall": round(reached / labels, 4) if labels else None,
             }
         )
     return {
@@ -60,12 +70,24 @@ def _figures(outcomes: Sequence[FrameEvaluation], role: Role) -> dict[str, Any]:
     }
 
 
-def _judged(outcome: FrameEvaluation, role: Role) -> tuple[NDArray[np.bool_], FloatArray, int]:
-    """Returns whether each judged report of a role is right (N,), its probability (N,), and the number of labels."""
-    matched = match_all(outcome)
+def _found_labels(outcome: FrameEvaluation, role: Role) -> FloatArray:
+    """Returns with which probability each label of a role that is found was reported (N,).
+
+    A report of either role finds it: an outer one finds an ego boundary if a nearer boundary is reported.
+    """
+    labels = _labels(outcome, role)
+    found = [pair.index for pair in match_all(outcome).matches if any(pair.label is label for label in labels)]
+    return _probabilities(outcome)[found]
+
+
+def _probabilities(outcome: FrameEvaluation) -> FloatArray:
+    return np.array([report.probability for report in outcome.reports], np.float64)
+
+
+def _role(report: ReportedBoundary) -> Role:
+    return "ego" if abs(report.position) == 1 else "outer"
+
+
+def _labels(outcome: FrameEvaluation, role: Role) -> list[LabeledLane]:
     ego = ego_labels(outcome.frame)
-    labels = len(ego) if role == "ego" else len(outcome.frame.lanes) - len(ego)
-    verdicts = {**{found.index: True for found in matched.matches}, **dict.fromkeys(matched.wrong_reports, False)}
-    chosen = [i for i in sorted(verdicts) if (abs(outcome.reports[i].position) == 1) == (role == "ego")]
-    probabilities = [outcome.reports[i].probability for i in chosen]
-    return np.array([verdicts[i] for i in chosen], bool), np.array(probabilities, np.float64), labels
+    return ego if role == "ego" else [lane for lane in outcome.frame.lanes if not any(lane is each for each in ego)]

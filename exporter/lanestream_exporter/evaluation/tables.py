@@ -22,7 +22,7 @@ _BOUNDARIES = ("frames", "right", "wrong", "missed", "ego base", "ego P", "ego R
 _KINDS = ("marked", "of", "edge P", "edge R", "type", "of", "constant", "color", "of", "constant")
 _NO_ROAD = ("pictures", "boundary", "marking", "ego lane", "share")
 _STILLS = ("stills", "with a loss", "boundaries", "lost", "gained")
-_TRADE = ("right", "wrong", "precision", "recall")
+_TRADE = ("right", "wrong", "precision", "found", "recall")
 _KINDS_TITLE = "Frames without markings in which one is reported, edges of the road, types and colors"
 _LITTLE = f"* says little: more than {HIGH_BASE_RATE:.0%} of what is judged are boundaries (base rate)"
 

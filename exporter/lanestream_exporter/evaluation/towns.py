@@ -15,7 +15,7 @@ from lanestream_exporter.evaluation.reliability import reliability_figures
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.scenes.layout import RoadStyle
 
-_STYLES: Final[dict[RoadStyle, float]] = {"street": 0.6, "campus": 0.4}
+TOWN_STYLES: Final[dict[RoadStyle, float]] = {"street": 0.6, "campus": 0.4}
 _SIZES: Final = ((1280, 720), (640, 480), (960, 540))
 # Differs from the last part of the seeds of training scenes.
 _SEED: Final = 5
@@ -24,7 +24,7 @@ _SEED: Final = 5
 def town_frames(count: int) -> LabeledImages:
     """Yields the first `count` frames of an endless series, each BGR (H, W, 3) after its labels."""
     for index in range(count):
-        scene = sample_scene(np.random.default_rng([0, index, _SEED]), *_SIZES[index % len(_SIZES)], _STYLES)
+        scene = sample_scene(np.random.default_rng([0, index, _SEED]), *_SIZES[index % len(_SIZES)], TOWN_STYLES)
         still = render_still(scene)
         yield still.labels, still.image
 

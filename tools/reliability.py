@@ -1,0 +1,70 @@
+"""Fits how often the candidate detector's decisions are right: the numbers in lanestream/detection/acceptance.py.
+
+Rendered towns, rendered scenes of all kinds and every third training frame go through the shipped networks as single
+images, with an acceptance that changes no probability. Neither validation nor test frames are used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain, islice
+from pathlib import Path
+
+import click
+import numpy as np
+from sklearn.linear_model import LogisticRegression
+
+from lanestream.detection.acceptance import Acceptance
+from lanestream.detection.candidate_detector import CandidateDetector
+from lanestream.engine import load_engine
+from lanestream.road.view import Image
+from lanestream_exporter.datasets.labels import LabeledFrame
+from lanestream_exporter.datasets.manifest import DatasetCollection
+from lanestream_exporter.evaluation.methods import ServedModel
+from lanestream_exporter.evaluation.outcomes import FrameEvaluation
+from lanestream_exporter.evaluation.reliability import ROLES, judged_reports
+from lanestream_exporter.evaluation.towns import TOWN_STYLES
+from lanestream_exporter.scenes import render_still, sample_scene
+from lanestream_exporter.scenes.scene import STYLES
+
+_SIZES = ((1280, 720), (640, 480), (960, 540))
+_TOWNS, _SCENES, _EVERY = 500, 400, 3
+# Differs from the last part of the seeds of training scenes and of evaluations.
+_SEED = 7
+
+
+def frames(data: Path | None) -> Iterator[tuple[LabeledFrame, Image]]:
+    """Yields the labels and the image of each frame."""
+    for index in range(_TOWNS + _SCENES):
+        rng = np.random.default_rng([0, index, _SEED])
+        still = render_still(sample_scene(rng, *_SIZES[index % 3], TOWN_STYLES if index < _TOWNS else STYLES))
+        yield still.labels, still.image
+    yield from islice(DatasetCollection.open(None, data).frames("train"), 0, None, _EVERY)
+
+
+@click.command()
+@click.option("--data", type=click.Path(path_type=Path), help="Folder of real frames.  [default: $LANESTREAM_DATA]")
+def main(data: Path | None) -> None:
+    """Print the slope and the offset for boundaries of the ego lane and for outer ones."""
+    engine = load_engine(provider="cpu")
+    name = engine.select()
+    detector = engine.detectors[name]
+    if not isinstance(detector, CandidateDetector):
+        raise click.ClickException("the shipped engine has no candidate detector")
+    neutral = {**engine.detectors, name: replace(detector, acceptance=Acceptance())}
+    method = ServedModel(replace(engine, detectors=neutral))
+    outcomes = [FrameEvaluation(frame, method.find(image)) for frame, image in frames(data)]
+    for role in ROLES:
+        judged = [judged_reports(outcome, role) for outcome in outcomes]
+        is_right = np.array(list(chain.from_iterable(right for right, _ in judged)))
+        decided = np.clip(np.array(list(chain.from_iterable(values for _, values in judged))), 1e-3, 1.0 - 1e-3)
+        model = LogisticRegression(C=1e4).fit(np.log(decided / (1.0 - decided))[:, None], is_right)
+        click.echo(
+            f"{role}: slope {model.coef_[0, 0]:.2f}, offset {model.intercept_[0]:.2f}, from {len(decided)} reports, "
+            f"{int(is_right.sum())} of them right"
+        )
+
+
+if __name__ == "__main__":
+    main()
