@@ -81,8 +81,8 @@ class Evaluation:
     images: dict[str, list[FrameEvaluation]]
     clips: dict[str, dict[str, ClipRun]]
     no_road: dict[str, list[NoRoadOutcome]]
-    towns: dict[str, list[FrameEvaluation]]
-    stills: dict[str, list[StillOutcome]]
+    towns: dict[str, list[FrameEvaluation]] = field(default_factory=dict)
+    stills: dict[str, list[StillOutcome]] = field(default_factory=dict)
 
     def figures(self) -> dict[str, Any]:
         """Returns all figures as written to the JSON file; docs/evaluation.md documents every key."""

@@ -28,9 +28,10 @@ LEAST: Final = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 def reliability_figures(outcomes: Sequence[FrameEvaluation]) -> dict[str, Any]:
     """Returns the reliability and the trade between precision and recall of both roles; see docs/evaluation.md.
 
-    Methods that report no probabilities have none.
+    Methods that report nothing, or no probabilities, have none.
     """
-    if not outcomes or any(report.probability is None for outcome in outcomes for report in outcome.reports):
+    probabilities = [report.probability for outcome in outcomes for report in outcome.reports]
+    if not probabilities or None in probabilities:
         return {}
     return {role: _figures(outcomes, role) for role in ROLES}
 

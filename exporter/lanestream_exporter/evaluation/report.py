@@ -98,7 +98,7 @@ def _candidate_charts(name: str, outcomes: Sequence[FrameEvaluation], drives: Ma
 
 
 def _reliability_charts(name: str, figures: Mapping[str, Any]) -> Iterator[Chart]:
-    parts = {"single images": figures["images"][name][OVERALL], "rendered towns": figures["towns"][name]}
+    parts = {"single images": figures["images"][name][OVERALL], "rendered towns": figures["towns"].get(name)}
     for where, part in parts.items():
         roles = part["reliability"] if part else {}
         if roles:

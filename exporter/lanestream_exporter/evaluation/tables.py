@@ -65,7 +65,7 @@ def figure_tables(figures: Mapping[str, Any]) -> Iterator[Table]:
 def _trades(figures: Mapping[str, Any]) -> Iterator[Table]:
     """Yields precision and recall from each probability on, of the first method, for the ego pair and outer ones."""
     first = next(iter(figures["images"]))
-    parts = {"single images": figures["images"][first]["overall"], "rendered towns": figures["towns"][first]}
+    parts = {"single images": figures["images"][first]["overall"], "rendered towns": figures["towns"].get(first)}
     for name, part in parts.items():
         roles = part["reliability"] if part else {}
         if roles:

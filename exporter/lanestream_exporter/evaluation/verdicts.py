@@ -28,7 +28,7 @@ def verdicts(figures: Groups) -> list[str]:
         whole = clips["overall"]
         lines.append(f"clips with the tracker: {_boundaries(whole['tracked'])}{_looks(whole['kinds']['tracked'])}")
     lines += _no_road(figures["no_road"][first])
-    lines += _towns(figures["towns"][first])
+    lines += _towns(figures["towns"].get(first, {}))
     lines += _stills(figures["stills"].get(first, {}))
     lines += _reliability(figures["images"][first]["overall"]["reliability"], "single images")
     return [*lines, *_warnings(figures["images"][first]["overall"], figures["datasets"][first])]

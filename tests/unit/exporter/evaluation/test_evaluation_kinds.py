@@ -185,13 +185,15 @@ def test_the_base_rate_is_the_share_of_ego_sides_with_a_boundary() -> None:
 
 
 def figures_of(outcomes: list[FrameEvaluation]) -> dict[str, Any]:
-    groups = {"boundaries": boundary_figures(outcomes), "kinds": kind_figures(outcomes)}
+    groups = {"boundaries": boundary_figures(outcomes), "kinds": kind_figures(outcomes), "reliability": {}}
     return {
         "methods": {"net": {}},
         "images": {"net": {"overall": groups}},
         "datasets": {"net": {"town": groups}},
         "clips": {"net": {}},
         "no_road": {"net": {}},
+        "towns": {},
+        "stills": {},
     }
 
 

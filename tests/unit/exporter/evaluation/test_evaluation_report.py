@@ -26,7 +26,7 @@ from lanestream_exporter.datasets.manifest import LabeledClip
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
 from lanestream_exporter.evaluation.boundaries import ReportedBoundary, match_ego
 from lanestream_exporter.evaluation.gallery import drawn
-from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, run_evaluation
+from lanestream_exporter.evaluation.measuring import OVERALL, Evaluation, EvaluationSet, Extras, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, ServedModel
 from lanestream_exporter.evaluation.outcomes import FrameEvaluation
 from lanestream_exporter.evaluation.report import write_report
@@ -97,7 +97,7 @@ def evaluation(clip: LabeledClip) -> Evaluation:
         for labels, image in [still(seed)]
     ]
     methods = [ServedModel(load_engine(provider="cpu")), *map(Baseline, BASELINES)]
-    return run_evaluation(methods, EvaluationSet("rendered", lambda: iter(frames), (clip,)), no_road=4)
+    return run_evaluation(methods, EvaluationSet("rendered", lambda: iter(frames), (clip,)), extras=Extras(4, 4, 6))
 
 
 @pytest.fixture(scope="module")
@@ -137,16 +137,18 @@ def documented() -> set[str]:
         if part.startswith("|"):
             keys.update(key for base in bases for key in table_keys(part, base))
         else:
-            bases = re.findall(r"`((?:images|datasets|conditions|clips|no_road)\.[^`]*)`", part) or [""]
+            bases = re.findall(r"`((?:images|datasets|conditions|clips|no_road|towns|stills)\.[^`]*)`", part) or [""]
     return keys
 
 
 def written(value: Any, path: str = "") -> Iterator[str]:
     if isinstance(value, dict):
-        names = dict.fromkeys(("methods", "images", "datasets", "conditions", "clips", "no_road"), "<method>")
+        names = dict.fromkeys(
+            ("methods", "images", "datasets", "conditions", "clips", "no_road", "towns", "stills"), "<method>"
+        )
         names |= {"images.<method>": "<drive>", "clips.<method>": "<clip>"}
         names |= {"datasets.<method>": "<dataset>", "conditions.<method>": "<condition>"}
-        names |= {"no_road.<method>": "<picture>"}
+        names |= {"no_road.<method>": "<picture>", "stills.<method>": "<source>"}
         for key, part in value.items():
             yield from written(part, f"{path}.{names.get(path, key)}".lstrip("."))
     elif isinstance(value, list) and value and isinstance(value[0], dict):
@@ -162,7 +164,7 @@ def test_the_documented_keys_are_the_written_keys(figures: dict[str, Any]) -> No
 
 def test_the_report_is_self_contained(evaluation: Evaluation, figures: dict[str, Any], tmp_path: Path) -> None:
     page = write_report(tmp_path / "new" / "folder", evaluation, figures).read_text(encoding="utf-8")
-    assert page.count("<svg") == page.count("</svg>") == 5
+    assert page.count("<svg") == page.count("</svg>") == 7
     assert page.count("data:image/jpeg;base64,") == 4
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
     assert not re.findall(r"<script|@import", page)
@@ -189,7 +191,7 @@ def test_the_tables_name_every_method_and_drive(figures: dict[str, Any]) -> None
     sets, conditions, clips = 2, 1, 2
     kinds = [4 * sets] * 2 + [4 * conditions] * 2 + [4 * drives, 4 * clips]
     assert [table.row_count for table in made] == [
-        *kinds, 4, 2 * drives, 2 * drives, 4 * drives, 4 * clips, 4 * clips, *[4 * drives] * 3
+        *kinds, 4, 4, 8, 7, 7, 2 * drives, 2 * drives, 4 * drives, 4 * clips, 4 * clips, *[4 * drives] * 3
     ]  # fmt: skip
 
 
@@ -238,12 +240,13 @@ def test_the_command_evaluates_own_frames(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text(json.dumps(record) + "\n")
     path = tmp_path / "made" / "figures.json"
     arguments = ["--data", str(tmp_path), "--format", "tusimple", "--json", str(path), "--out", str(tmp_path / "made")]
-    arguments += ["--no-road", "2"]
+    arguments += ["--labels-only"]
     result = CliRunner().invoke(command, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     figures = json.loads(path.read_text())
     assert figures["clips"] == {name: {} for name in figures["methods"]}
-    assert {part[OVERALL]["pictures"] for part in figures["no_road"].values()} == {2}
+    for name in ("no_road", "towns", "stills"):
+        assert not any(figures[name].values())
     baseline = figures["images"][BASELINES[0].name][OVERALL]
     assert (baseline["boundaries"]["ego"]["right"], baseline["boundaries"]["ego"]["missed"]) == (2, 0)
     assert (tmp_path / "made" / "report.html").is_file()
