@@ -83,9 +83,10 @@ def _propose(**changes: Any) -> Leave:
     real = proposals.propose
 
     def propose(channels: Any, context: Any, prior: Any, fitted: Any, limit: int = proposals.MOST_CANDIDATES) -> Any:
-        if "tracked" in changes:
-            context = replace(context, tracked=None)
-        return real(channels, context, prior, None if "fitted" in changes else fitted, limit)
+        # Tracked boundaries are still accepted more easily.
+        searched = replace(context, tracked=None) if "tracked" in changes else context
+        found = real(channels, searched, prior, None if "fitted" in changes else fitted, limit)
+        return replace(found, tracked=context.tracked)
 
     return _replace(candidate_detector, "propose", propose)
 

@@ -27,10 +27,11 @@ REGRESSOR_ANCHORS: Final[FloatArray] = np.array([1.0, 0.4, 0.15])
 # Where the horizon of an unknown camera may be, as shares of the height; the regressor tries each. Neighbors differ by
 # about a sixth of the depth. A camera that looks down has its horizon above the picture.
 UNKNOWN_HORIZONS: Final = (-0.36, -0.16, 0.02, 0.17, 0.29, 0.39, 0.48, 0.57)
-# The network sees the row better the nearer its crop assumed it, so a row that was found is refined at most so often,
-# until it moves by less than this, in depths.
+# The network sees the row better the nearer its crop assumed it. So a row that was found is refined, at most so often,
+# until it moves by less than this, in depths, or the uncertainty is more than this factor of the first one.
 _REFINEMENTS: Final = 3
 _SETTLED: Final = 0.01
+_WORSE: Final = 1.1
 # How far a given horizon moves with the vehicle's pitch, in depths.
 _MOST_PITCH: Final = 0.05
 # A doubtful horizon is given up for one with less than this share of its uncertainty.
@@ -89,7 +90,12 @@ class RegressorOutput:
 
     def is_clearer_than(self, other: RegressorOutput) -> bool:
         """Whether it shows a road, and with much less uncertainty than `other`."""
-        return bool(self.presence.max() >= _LIKELY and self.uncertainty < _CLEARER * other.uncertainty)
+        return self.shows_road and self.uncertainty < _CLEARER * other.uncertainty
+
+    @property
+    def shows_road(self) -> bool:
+        """Whether at least one boundary is likely to exist."""
+        return bool(self.presence.max() >= _LIKELY)
 
     @property
     def mirrored(self) -> RegressorOutput:
@@ -269,10 +275,13 @@ class RoadRegressor:
         best = min(range(len(views)), key=lambda i: outputs[i].uncertainty)
         if expected is not None and not outputs[best].is_clearer_than(outputs[0]):
             return expected
-        found = outputs[best].view(views[best])
-        for _ in range(_REFINEMENTS):
-            before = found
-            found = RegressorOutput.of(infer("regressor", self.crop(detail, before)[None])[0]).view(before)
+        seen, found = outputs[best], outputs[best].view(views[best])
+        # Where it sees no road at first, a closer look must not talk it into one.
+        for _ in range(_REFINEMENTS if seen.shows_road else 0):
+            closer = RegressorOutput.of(infer("regressor", self.crop(detail, found)[None])[0])
+            if closer.uncertainty > _WORSE * seen.uncertainty:
+                break
+            before, found = found, closer.view(found)
             if abs(found.horizon - before.horizon) < _SETTLED * found.depth:
                 break
         return found.horizon

@@ -160,13 +160,23 @@ def test_an_unknown_horizon_is_looked_for_at_several_rows_and_then_where_it_was_
 
 
 def test_a_horizon_that_was_found_is_refined_until_it_hardly_moves() -> None:
-    infer = FakeRegressor(output_for(VIEW, horizon=0.05), looks_at(SEARCHED, [0.05, 0.005, *[0.05] * 6]))
+    infer = FakeRegressor(output_for(VIEW, horizon=0.05), looks_at(SEARCHED, [0.05, 0.015, *[0.05] * 6]))
     _, view = REGRESSOR.predict(ROAD, None, infer)
     assert len(infer.inputs) == 1 + 3 + 1, "it always moves"
     row = SEARCHED[1].horizon + 0.02 * SEARCHED[1].depth
     for _ in range(4):
         row += 0.05 * (HEIGHT - 1.0 - row)
     assert view.horizon == pytest.approx(row, abs=1.0)
+
+
+@pytest.mark.parametrize(("sigma", "presence"), [(0.005, 0.9), (0.015, 0.3)], ids=["less certain", "no road"])
+def test_a_horizon_is_not_refined_towards_less_certainty_or_without_a_road(sigma: float, presence: float) -> None:
+    looks = looks_at(SEARCHED, [0.05, sigma, *[0.05] * 6])
+    looks[:, 12:14] = presence
+    infer = FakeRegressor(output_for(VIEW, horizon=0.05), looks)
+    _, view = REGRESSOR.predict(ROAD, None, infer)
+    row = SEARCHED[1].horizon + 0.02 * SEARCHED[1].depth
+    assert view.horizon == pytest.approx(row + 0.05 * (HEIGHT - 1.0 - row), abs=1.0), "only the last look moved it"
 
 
 @pytest.mark.parametrize(
