@@ -20,6 +20,7 @@ def main(path: Path) -> None:
         evaluation = json.loads(path.read_text(encoding="utf-8"))
         images, clips = evaluation["images"], evaluation["clips"]
         datasets, conditions = evaluation["datasets"], evaluation["conditions"]
+        towns = {method: {"rendered towns": part} for method, part in evaluation["towns"].items() if part}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise click.ClickException(f"{path} was not written by `lanestream evaluate --json`: {error}") from error
     click.echo("\n".join(f"- {line}" for line in evaluation["verdicts"]))
@@ -33,6 +34,9 @@ def main(path: Path) -> None:
         ("A. Candidates by the detector", _CANDIDATES, _rows(images, _detected)),
         ("Proposal recall", _PROPOSAL_RECALL, _rows(images, _proposal_recall)),
         ("B. Single images", _BOUNDARIES, _rows(images, lambda groups: _boundaries(groups["boundaries"]))),
+        ("Rendered towns", _BOUNDARIES, _rows(towns, lambda groups: _boundaries(groups["boundaries"]))),
+        ("Reliability, single images", _TRADE, _trade(images, "overall")),
+        ("Reliability, rendered towns", _TRADE, _trade(towns, "rendered towns")),
         ("B. With the tracker", _BOUNDARIES, _rows(clips, lambda groups: _boundaries(groups["tracked"]))),
         (
             "B. Without the tracker",
@@ -57,6 +61,7 @@ _CANDIDATES = ("precision", "recall", "accuracy", "average precision", "base rat
 _PROPOSAL_RECALL = ("ego, 8", "ego, 16", "ego, 32", "all, 8", "all, 16", "all, 32")
 _BOUNDARIES = ("ego base rate", "ego precision", "ego recall", "ego error, px", "all precision", "all recall")
 _KINDS = ("frames with a false marking", "edge precision", "edge recall", "type right", "color right")
+_TRADE = ("ego precision", "ego recall", "outer precision", "outer recall")
 _STEADINESS = ("both ego boundaries", "jitter, px", "identity switches")
 _LATERAL = ("10 m, px", "ratio to constant", "30 m, px", "ratio to constant", "reached 30 m", "ratio, straight")
 _METRICS = ("TuSimple Acc", "FP", "FN", "F1 at IoU 0.5")
@@ -102,6 +107,18 @@ def _proposal_recall(groups: Groups) -> list[str]:
         for part in parts
         for number in (8, 16, 32)
     ]
+
+
+def _trade(methods: Mapping[str, Any], drive: str) -> Iterable[list[str]]:
+    """Yields a row for each probability from which boundaries count, of each method that reports probabilities."""
+    for method, drives in methods.items():
+        roles = drives[drive]["reliability"].values()
+        for rows in zip(*(role["trade"] for role in roles), strict=True):
+            cells = []
+            for row, role in zip(rows, roles, strict=True):
+                cells.append(f"{_share(row['precision'])} ({row['right']} / {row['right'] + row['wrong']})")
+                cells.append(f"{_share(row['recall'])} ({row['found']} / {role['labels']})")
+            yield [f"{method}, from {rows[0]['least']}", *cells]
 
 
 def _boundaries(part: Groups) -> list[str]:

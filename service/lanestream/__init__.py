@@ -1,3 +1,3 @@
 """Lanestream: camera frames in, tracked lane lines out."""
 
-__version__ = "0.13.0"
+__version__ = "0.14.0"
