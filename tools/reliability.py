@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 
 import click
 import numpy as np
 from sklearn.linear_model import LogisticRegression
 
-from lanestream.detection.acceptance import Acceptance
+from lanestream.detection.acceptance import Acceptance, is_certain_lane
 from lanestream.detection.candidate_detector import CandidateDetector
 from lanestream.engine import load_engine
 from lanestream.road.view import Image
@@ -23,7 +23,7 @@ from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.evaluation.methods import ServedModel
 from lanestream_exporter.evaluation.outcomes import FrameEvaluation
-from lanestream_exporter.evaluation.reliability import ROLES, judged_reports
+from lanestream_exporter.evaluation.reliability import Role, judged_reports
 from lanestream_exporter.evaluation.towns import TOWN_STYLES
 from lanestream_exporter.scenes import render_still, sample_scene
 from lanestream_exporter.scenes.scene import STYLES
@@ -46,7 +46,7 @@ def frames(data: Path | None) -> Iterator[tuple[LabeledFrame, Image]]:
 @click.command()
 @click.option("--data", type=click.Path(path_type=Path), help="Folder of real frames.  [default: $LANESTREAM_DATA]")
 def main(data: Path | None) -> None:
-    """Print the slope and the offset for boundaries of the ego lane and for outer ones."""
+    """Print the slope and the offset for boundaries of the ego lane, outer ones, and those beside a certain lane."""
     engine = load_engine(provider="cpu")
     name = engine.select()
     detector = engine.detectors[name]
@@ -55,15 +55,27 @@ def main(data: Path | None) -> None:
     neutral = {**engine.detectors, name: replace(detector, acceptance=Acceptance())}
     method = ServedModel(replace(engine, detectors=neutral))
     outcomes = [FrameEvaluation(frame, method.find(image)) for frame, image in frames(data)]
-    for role in ROLES:
-        judged = [judged_reports(outcome, role) for outcome in outcomes]
-        is_right = np.array(list(chain.from_iterable(right for right, _ in judged)))
-        decided = np.clip(np.array(list(chain.from_iterable(values for _, values in judged))), 1e-3, 1.0 - 1e-3)
+    certain = [outcome for outcome in outcomes if _has_certain_lane(outcome)]
+    others = [outcome for outcome in outcomes if not _has_certain_lane(outcome)]
+    groups: tuple[tuple[str, Role, list[FrameEvaluation]], ...] = (
+        ("ego", "ego", outcomes),
+        ("outer", "outer", others),
+        ("beside_lane", "outer", certain),
+    )
+    for title, role, part in groups:
+        judged = [judged_reports(outcome, role) for outcome in part]
+        is_right = np.concatenate([right for right, _ in judged])
+        decided = np.clip(np.concatenate([values for _, values in judged]), 1e-3, 1.0 - 1e-3)
         model = LogisticRegression(C=1e4).fit(np.log(decided / (1.0 - decided))[:, None], is_right)
         click.echo(
-            f"{role}: slope {model.coef_[0, 0]:.2f}, offset {model.intercept_[0]:.2f}, from {len(decided)} reports, "
+            f"{title}: slope {model.coef_[0, 0]:.2f}, offset {model.intercept_[0]:.2f}, from {len(decided)} reports, "
             f"{int(is_right.sum())} of them right"
         )
+
+
+def _has_certain_lane(outcome: FrameEvaluation) -> bool:
+    ego = [report for report in outcome.reports if abs(report.position) == 1]
+    return is_certain_lane([(report.kind, report.probability or 0.0) for report in ego])
 
 
 if __name__ == "__main__":

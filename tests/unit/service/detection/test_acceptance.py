@@ -15,7 +15,11 @@ from lanestream.road.results import Detection
 from lanestream.road.view import RoadView
 
 VIEW = RoadView(640, 360, 150.0)
-STRICT = Acceptance(ego=Reliability(1.0, -1.0, least=0.5), outer=Reliability(1.0, -2.0, least=0.6))
+STRICT = Acceptance(
+    ego=Reliability(1.0, -1.0, least=0.5),
+    outer=Reliability(1.0, -2.0, least=0.6),
+    beside_lane=Reliability(1.0, -1.5, least=0.5),
+)
 
 
 def found(position: float, probability: float, road_edge: float = 0.0) -> Detection:
@@ -43,13 +47,29 @@ def test_a_probability_changes_by_its_logit() -> None:
 
 
 def test_outer_boundaries_must_be_more_probable_than_those_of_the_ego_lane() -> None:
-    probable = 0.9
-    result = accepted([found(position, probable) for position in (-3.4, -1.2, 1.2, 3.4)])
+    result = accepted([found(position, 0.9) for position in (-3.4, -1.2, 1.2, 3.4)])
     assert list(result) == [-1.2, 1.2], "the outer ones would have 0.55"
     assert list(result.values()) == pytest.approx([9.0 / (9.0 + np.e)] * 2)
     result = accepted([found(position, 0.97) for position in (-3.4, -1.2, 1.2, 3.4)])
     assert list(result) == [-3.4, -1.2, 1.2, 3.4], "from left to right"
     assert result[-3.4] < result[-1.2]
+
+
+@pytest.mark.parametrize(
+    ("right_one", "road_edge", "certain"),
+    [(0.98, 0.2, True), (0.97, 0.2, False), (0.98, 0.8, False), (None, 0.0, False)],
+    ids=["two certain markings", "a less certain one", "an edge", "one boundary"],
+)
+def test_outer_boundaries_are_usual_beside_a_lane_with_two_certain_markings(
+    right_one: float | None, road_edge: float, certain: bool
+) -> None:
+    detections = [found(-3.4, 0.85), found(-1.2, 0.99)]
+    if right_one is not None:
+        detections.append(found(1.2, right_one, road_edge))
+    result = accepted(detections)
+    assert (-3.4 in result) == certain, "0.56 beside such a lane, else 0.43"
+    if certain:
+        assert result[-3.4] == pytest.approx(STRICT.beside_lane.probability(0.85))
 
 
 def test_the_nearest_accepted_boundary_of_a_side_is_that_of_the_ego_lane() -> None:
@@ -76,8 +96,8 @@ def test_the_road_ends_at_its_edge() -> None:
 
 
 def test_the_shipped_acceptance_is_monotonic_and_stricter_than_the_decisions() -> None:
-    for reliability in (SHIPPED.ego, SHIPPED.outer):
+    for reliability in (SHIPPED.ego, SHIPPED.outer, SHIPPED.beside_lane):
         values = [reliability.probability(decided) for decided in np.linspace(0.01, 0.99, 50).tolist()]
         assert all(low < high for low, high in pairwise(values))
         assert reliability.probability(0.9) < 0.9, "a classifier is too certain of the best of many candidates"
-    assert SHIPPED.outer.least > SHIPPED.ego.least
+    assert SHIPPED.outer.least > SHIPPED.beside_lane.least > SHIPPED.ego.least
