@@ -276,7 +276,7 @@ class RoadRegressor:
         if expected is not None and not outputs[best].is_clearer_than(outputs[0]):
             return expected
         seen, found = outputs[best], outputs[best].view(views[best])
-        # Where it sees no road at first, a closer look must not talk it into one.
+        # Where it sees no road at first, closer looks would sometimes invent one.
         for _ in range(_REFINEMENTS if seen.shows_road else 0):
             closer = RegressorOutput.of(infer("regressor", self.crop(detail, found)[None])[0])
             if closer.uncertainty > _WORSE * seen.uncertainty:
