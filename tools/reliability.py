@@ -18,6 +18,7 @@ from sklearn.linear_model import LogisticRegression
 from lanestream.detection.acceptance import Acceptance, is_certain_lane
 from lanestream.detection.candidate_detector import CandidateDetector
 from lanestream.engine import load_engine
+from lanestream.errors import LanestreamError
 from lanestream.road.view import Image
 from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.datasets.manifest import DatasetCollection
@@ -35,12 +36,12 @@ _SEED = 7
 
 
 def frames(data: Path | None) -> Iterator[tuple[LabeledFrame, Image]]:
-    """Yields the labels and the image of each frame."""
+    """Yields the labels and the image of each frame. Raises LabelError at once if there are no real frames."""
+    yield from islice(DatasetCollection.open(None, data).frames("train"), 0, None, _EVERY)
     for index in range(_TOWNS + _SCENES):
         rng = np.random.default_rng([0, index, _SEED])
         still = render_still(sample_scene(rng, *_SIZES[index % 3], TOWN_STYLES if index < _TOWNS else STYLES))
         yield still.labels, still.image
-    yield from islice(DatasetCollection.open(None, data).frames("train"), 0, None, _EVERY)
 
 
 @click.command()
@@ -54,7 +55,10 @@ def main(data: Path | None) -> None:
         raise click.ClickException("the shipped engine has no candidate detector")
     neutral = {**engine.detectors, name: replace(detector, acceptance=Acceptance())}
     method = ServedModel(replace(engine, detectors=neutral))
-    outcomes = [FrameEvaluation(frame, method.find(image)) for frame, image in frames(data)]
+    try:
+        outcomes = [FrameEvaluation(frame, method.find(image)) for frame, image in frames(data)]
+    except LanestreamError as error:
+        raise click.ClickException(str(error)) from error
     certain = [outcome for outcome in outcomes if _has_certain_lane(outcome)]
     others = [outcome for outcome in outcomes if not _has_certain_lane(outcome)]
     groups: tuple[tuple[str, Role, list[FrameEvaluation]], ...] = (

@@ -31,7 +31,7 @@ def image_files(folder: Path, notify: Callable[[str], object] | None = None) -> 
             f"no images in the folder {folder}{holds}", f"accepted file types: {', '.join(IMAGE_SUFFIXES)}"
         )
     if passed_over and notify is not None:
-        notify(f"{folder}: skipped what is not an image file ({passed_over})")
+        notify(f"{folder}: skipped everything but image files ({passed_over})")
     return sorted(files, key=_natural_key)
 
 

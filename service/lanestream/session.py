@@ -37,7 +37,7 @@ _HORIZON_GAIN: Final = 0.1
 # A horizon is doubtful after so many seconds in which the ego-lane prior was more uncertain than this. It is then
 # searched for again. One that is found this far away, in depths, replaces the estimate at once.
 _DOUBTFUL_S: Final = 1.0
-_UNCERTAIN: Final = 0.06
+_MOST_UNCERTAINTY: Final = 0.06
 _MOVED: Final = 0.1
 # The limits of a saved state: a side of a working image in pixels, and the row of a horizon as a share of the height.
 # Detectors place no horizon lower, because some road must be visible below it, and none higher: cameras that look down
@@ -274,7 +274,7 @@ class Session:
         found_anew = context.is_doubtful and expected is not None and abs(view.horizon - expected) > _MOVED * view.depth
         if self._size not in (None, size) or is_cut or found_anew:
             self._horizon, self._evidence = None, 0.0
-        certain = detections.uncertainty <= _UNCERTAIN or context.is_doubtful
+        certain = detections.uncertainty <= _MOST_UNCERTAINTY or context.is_doubtful
         self._uncertain_s = 0.0 if certain else min(self._uncertain_s + seconds, _DOUBTFUL_S)
         self._size = size
         prior_horizon = detections.prior_horizon

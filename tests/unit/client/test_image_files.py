@@ -62,7 +62,7 @@ def test_what_a_folder_holds_beside_images_is_counted(tmp_path: Path) -> None:
     lines: list[str] = []
     assert [path.name for path in image_files(tmp_path, lines.append)] == ["2.JPG", "10.jpg"]
     assert lines == [
-        f"{tmp_path}: skipped what is not an image file (.mp4: 1, .txt: 2, files without a suffix: 1, folders: 1)"
+        f"{tmp_path}: skipped everything but image files (.mp4: 1, .txt: 2, files without a suffix: 1, folders: 1)"
     ]
     with open_source(str(tmp_path), notify=lines.append) as source:
         assert source.length == 2
