@@ -17,7 +17,7 @@ from av.video.stream import VideoStream
 from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 from lanestream_exporter.scenes.clip import Clip, without_collisions
 
-SEED, WIDTH, HEIGHT, FPS, SECONDS = 24, 960, 540, 30, 16
+SEED, WIDTH, HEIGHT, FPS, SECONDS = 8, 960, 540, 30, 16
 # The page knows the camera of its demo: service/lanestream/api/static/settings.js has the same two values.
 CAMERA_HEIGHT, FIELD_OF_VIEW = 1.4, 60.0
 MOST_BYTES = 2_000_000

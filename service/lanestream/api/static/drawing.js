@@ -4,6 +4,7 @@
  * Coordinates are pixels of the image that the service has answered; the canvas is scaled to them.
  */
 
+import { laneX } from "./client/index.js";
 import { EGO_LANE, lineStyle, positionColor } from "./lane-styles.js";
 
 const SAMPLES = 40;
@@ -57,17 +58,6 @@ export function drawHorizon(context, fraction) {
 }
 
 /**
- * Returns the column of a boundary at a row: x(y) = v + b u + k / u, with u = y - horizon.
- * @param {any} lane
- * @param {number} y
- */
-function column(lane, y) {
-  const [v, b, k] = lane.coefficients;
-  const u = Math.max(y - lane.horizon, 1);
-  return v + b * u + k / u;
-}
-
-/**
  * Fills the ego lane where both of its boundaries are reported, fading out with distance.
  * @param {CanvasRenderingContext2D} context
  * @param {any} answer
@@ -87,8 +77,8 @@ function fillEgoLane(context, answer) {
   context.fillStyle = fading;
   const rows = Array.from({ length: SAMPLES }, (_, n) => bottom + ((top - bottom) * n) / (SAMPLES - 1));
   context.beginPath();
-  for (const y of rows) context.lineTo(column(left, y), y);
-  for (const y of rows.reverse()) context.lineTo(column(right, y), y);
+  for (const y of rows) context.lineTo(laneX(left, y), y);
+  for (const y of rows.reverse()) context.lineTo(laneX(right, y), y);
   context.fill();
 }
 
@@ -153,7 +143,7 @@ function fillRibbon(context, lane, rows, strand, color, rim, road) {
     const u = Math.max(y - lane.horizon, 1);
     const obliquity = Math.min(3, Math.hypot(1, lane.coefficients[1] - lane.coefficients[2] / (u * u)));
     const half = halfWidth(lane, y, road);
-    const middle = column(lane, y) + 2 * strand.middle * half * obliquity;
+    const middle = laneX(lane, y) + 2 * strand.middle * half * obliquity;
     const reach = (strand.width * half + rim) * obliquity;
     return [middle - reach, middle + reach, y];
   });
@@ -181,7 +171,7 @@ function drawTicks(context, lane, style, road) {
       [0.4 * half, style.color],
     ])) {
       context.fillStyle = color;
-      context.fillRect(column(lane, y), y - height, length, 2 * height);
+      context.fillRect(laneX(lane, y), y - height, length, 2 * height);
     }
   }
 }
@@ -201,7 +191,7 @@ function drawLabel(context, lane, answer, scale) {
   context.textBaseline = "middle";
   const width = Math.max(context.measureText(text).width + 14 * scale, 24 * scale);
   const height = 25 * scale;
-  const left = Math.min(Math.max(0, column(lane, y) - width / 2), answer.width - width);
+  const left = Math.min(Math.max(0, laneX(lane, y) - width / 2), answer.width - width);
   context.globalAlpha = lane.state === "predicted" ? 0.6 : 1;
   for (const [inset, color] of /** @type {[number, string][]} */ ([
     [0, DARK],

@@ -1,0 +1,485 @@
+/** The live page: connects a source, the streams of its detectors, and what shows their answers. */
+
+import { Access } from "./access.js";
+import { drawMap } from "./birds-eye.js";
+import { Capture } from "./capture.js";
+import { LaneClient } from "./client/index.js";
+import { LatencyView } from "./latency.js";
+import { Notices, eventNotice } from "./notices.js";
+import { Problem, explain } from "./problems.js";
+import { Readings } from "./readings.js";
+import { Recording, download, downloadLink, nameNow } from "./recording.js";
+import { LiveSession } from "./session.js";
+import { SettingsForm } from "./settings-form.js";
+import { DEMO_CAMERA, hashFromSettings, settingsFromHash, streamOptions } from "./settings.js";
+import { listenForShortcuts } from "./shortcuts.js";
+import { snippet } from "./snippets.js";
+import { restoreTheme, toggleTheme } from "./theme.js";
+
+/**
+ * @typedef {import("./capture.js").SourceKind} SourceKind
+ * @typedef {import("./session.js").LanePane} LanePane
+ * @typedef {import("./client/index.js").LaneError} LaneError
+ */
+
+const BASE = new URL(".", location.href);
+// A page that nobody closes waits for its service for an hour.
+const RECONNECT_S = 3600;
+const SAME_ERROR_MS = 5000;
+const LANGUAGES = /** @type {const} */ (["curl", "python", "javascript"]);
+
+/**
+ * @template {HTMLElement} Kind
+ * @param {string} id
+ * @returns {Kind}
+ */
+function element(id) {
+  return /** @type {Kind} */ (document.getElementById(id));
+}
+
+class LivePage {
+  #root = element("live");
+  #notices = new Notices(document);
+  #latency = new LatencyView(document);
+  #readings = new Readings(document);
+  #access = new Access(BASE, element("access"));
+  #form = new SettingsForm(element("settings"), settingsFromHash(location.hash), {
+    onChange: () => this.#applySettings(),
+    onHorizon: (horizon) => this.#previewHorizon(horizon),
+  });
+  /** @type {Capture | null} */
+  #capture = null;
+  /** @type {LiveSession | null} */
+  #session = null;
+  /** @type {Map<LanePane, Recording>} */
+  #recordings = new Map();
+  #isPaused = false;
+  #drawn = 0;
+  #language = /** @type {import("./settings.js").Language} */ ("curl");
+  /** @type {Map<string, number>} when each kind of error was shown last */
+  #shownErrors = new Map();
+
+  constructor() {
+    this.#wire();
+    this.#show();
+    void this.#offerDetectors();
+    drawMap(element("map"), [], () => 0);
+  }
+
+  /** The camera in use: that of the settings, or of the demo clip. */
+  get #camera() {
+    const chosen = this.#form.settings.camera;
+    if (chosen !== undefined) return chosen;
+    return this.#capture?.kind === "demo" ? DEMO_CAMERA : null;
+  }
+
+  /** The options of `start` for each stream. */
+  get #options() {
+    const { settings } = this.#form;
+    const detectors = settings.detector === "both" ? ["candidates", "regression"] : [settings.detector];
+    return detectors.map((detector) => streamOptions(settings, this.#camera, detector));
+  }
+
+  /**
+   * Starts a source in the place of the present one.
+   * @param {SourceKind} kind
+   * @param {string | File | null} video
+   */
+  async start(kind, video = null) {
+    await this.stop();
+    this.#notices.clearProblem();
+    const capture = new Capture(kind, {
+      onFrame: (frame) => this.#session?.send(frame),
+      onEnd: (problem) => void this.#ended(capture, problem),
+    });
+    this.#capture = capture;
+    this.#show();
+    try {
+      await capture.open(video);
+    } catch (error) {
+      if (this.#capture !== capture) return;
+      this.#capture = null;
+      this.#notices.problem(error instanceof Problem ? error.line : String(error));
+      this.#show();
+      return;
+    }
+    if (this.#capture === capture) this.#connect();
+  }
+
+  async stop() {
+    await this.#stopRecording();
+    this.#session?.close();
+    this.#capture?.close();
+    this.#session = null;
+    this.#capture = null;
+    this.#isPaused = false;
+    this.#readings.clear();
+    drawMap(element("map"), [], () => 0);
+    this.#show();
+  }
+
+  togglePause() {
+    if (this.#capture === null) return;
+    this.#isPaused = !this.#isPaused;
+    this.#capture.paused = this.#isPaused;
+    this.#show();
+  }
+
+  breakConnection() {
+    if (this.#session === null) return;
+    this.#notices.log("You have broken the connection");
+    this.#session.breakConnection();
+  }
+
+  snapshot() {
+    const pane = this.#session?.panes[0];
+    if (!pane?.frame) return;
+    pane.canvas.toBlob((blob) => blob && download({ name: `${nameNow()}.png`, blob }), "image/png");
+  }
+
+  async toggleRecording() {
+    if (this.#recordings.size > 0) {
+      await this.#stopRecording();
+      return;
+    }
+    const panes = this.#session?.panes.filter((pane) => pane.frame !== null) ?? [];
+    if (panes.length === 0) return;
+    if (!Recording.isSupported) {
+      this.#notices.problem(new Problem("This browser can't record", "Use a current Chrome, Edge, Firefox or Safari").line);
+      return;
+    }
+    const name = nameNow();
+    for (const pane of panes) {
+      const suffix = panes.length > 1 ? `-${pane.ready?.detector}` : "";
+      this.#recordings.set(pane, new Recording(pane.canvas, name + suffix));
+    }
+    this.#show();
+  }
+
+  async #stopRecording() {
+    if (this.#recordings.size === 0) return;
+    const recordings = [...this.#recordings.values()];
+    this.#recordings.clear();
+    this.#show();
+    const files = (await Promise.all(recordings.map((recording) => recording.stop()))).flat();
+    const area = element("downloads");
+    for (const link of area.querySelectorAll("a")) URL.revokeObjectURL(link.href);
+    area.replaceChildren("Recorded: ", ...files.map(downloadLink));
+    area.hidden = false;
+  }
+
+  #connect() {
+    this.#session?.close();
+    const client = new LaneClient(BASE, { reconnectS: RECONNECT_S, ...(this.#access.token ? { token: this.#access.token } : {}) });
+    const session = new LiveSession(client, this.#options, {
+      onDrawn: (pane, stages, drawn) => this.#session === session && this.#showAnswer(pane, stages, drawn),
+      onState: () => this.#session === session && this.#show(),
+      onReturn: (pane, back) => this.#session === session && pane === session.panes[0] && this.#showReturn(back),
+      onError: (_, error) => this.#session === session && void this.#failed(error),
+      onRoom: (hasRoom) => this.#session === session && this.#capture && (this.#capture.hasRoom = hasRoom),
+      onPlan: () => this.#session === session && this.#capture && (this.#capture.plan = session.pacing.plan),
+    });
+    this.#session = session;
+    this.#latency.reset();
+    const panes = element("panes");
+    panes.dataset.count = String(session.panes.length);
+    panes.replaceChildren(
+      ...session.panes.map((pane, index) => {
+        const figure = document.createElement("figure");
+        const caption = document.createElement("figcaption");
+        caption.textContent = String(this.#options[index].detector ?? "");
+        caption.hidden = session.panes.length === 1;
+        figure.append(pane.canvas, caption);
+        return figure;
+      }),
+    );
+    if (this.#capture) this.#capture.plan = session.pacing.plan;
+    this.#show();
+  }
+
+  /**
+   * @param {Capture} capture
+   * @param {Problem | null} problem
+   */
+  async #ended(capture, problem) {
+    if (this.#capture !== capture) return;
+    await this.stop();
+    if (problem !== null) this.#notices.problem(problem.line);
+  }
+
+  /** @param {LaneError} error */
+  async #failed(error) {
+    if (!error.fatal) {
+      const now = performance.now();
+      if (now - (this.#shownErrors.get(error.code) ?? -Infinity) < SAME_ERROR_MS) return;
+      this.#shownErrors.set(error.code, now);
+      this.#notices.log(explain(error), "caution");
+      return;
+    }
+    if (error.code === "unauthorized") {
+      this.#session?.close();
+      const reason = this.#access.token === null ? "" : "The token has expired or is not valid any more. Enter the key again.";
+      if (this.#capture) this.#capture.paused = true;
+      const hasToken = await this.#access.ask(reason);
+      this.#show();
+      if (hasToken && this.#capture) {
+        this.#capture.paused = this.#isPaused;
+        this.#connect();
+        return;
+      }
+    }
+    await this.stop();
+    this.#notices.problem(explain(error));
+  }
+
+  #applySettings() {
+    const hash = hashFromSettings(this.#form.settings);
+    if (hash !== location.hash) history.replaceState(null, "", hash === "" ? location.pathname + location.search : hash);
+    const options = this.#options;
+    if (this.#session !== null) {
+      if (options.length === this.#session.panes.length) this.#session.restart(options);
+      else void this.#stopRecording().then(() => this.#connect());
+    }
+    this.#show();
+  }
+
+  /** @param {number | null} horizon */
+  #previewHorizon(horizon) {
+    for (const pane of this.#session?.panes ?? []) {
+      pane.horizon = horizon;
+      pane.redraw();
+    }
+  }
+
+  /**
+   * @param {LanePane} pane
+   * @param {import("./latency.js").Stages} stages
+   * @param {number} drawn
+   */
+  #showAnswer(pane, stages, drawn) {
+    const answer = /** @type {import("./client/index.js").LanesMessage} */ (pane.answer);
+    const frame = /** @type {import("./capture.js").CapturedFrame} */ (pane.frame);
+    this.#recordings.get(pane)?.add(answer);
+    if (this.#session?.panes.length === 2) {
+      const caption = pane.canvas.nextElementSibling;
+      if (caption) caption.textContent = `${pane.ready?.detector} · ${answer.timing_ms.total.toFixed(0)} ms in the service`;
+    }
+    if (pane !== this.#session?.panes[0]) return;
+    if (this.#drawn === 0 || element("panes").hidden) this.#show();
+    this.#drawn += 1;
+    this.#readings.show(answer);
+    drawMap(element("map"), answer.lanes, pane.unseen);
+    element("stage").dataset.departure = answer.departure?.state === "none" ? "" : (answer.departure?.side ?? "");
+    for (const event of answer.events) this.#notices.show(...eventNotice(event));
+    const isFresh = this.#latency.add(stages, drawn, answer.dropped);
+    this.#root.dataset.drawn = String(this.#drawn);
+    if (!isFresh) return;
+    const { fps, median, p95, dropped } = this.#latency.summary;
+    Object.assign(this.#root.dataset, { fps: fps.toFixed(1), median: median.toFixed(1), p95: p95.toFixed(1), dropped });
+    element("sent").textContent =
+      `Sent as ${frame.width} × ${frame.height} JPEG, ${Math.round(frame.blob.size / 1000)} KB` +
+      ` to ${pane.ready?.model ?? "the service"} on ${pane.ready?.provider ?? "?"}.`;
+  }
+
+  /** @param {import("./session.js").Return} back */
+  #showReturn({ resumed, seconds, kept }) {
+    const after = `Back after ${seconds.toFixed(1)} s`;
+    if (!resumed) this.#notices.show(`${after} in a new session: ids start again`, "caution");
+    else if (kept.length === 0) this.#notices.show(`${after} in the same session`, "good");
+    else this.#notices.show(`${after}: ${kept.length === 1 ? "line" : "lines"} ${list(kept)} kept ${kept.length === 1 ? "its id" : "their ids"}`, "good");
+  }
+
+  /** Shows the state of everything but the answers. */
+  #show() {
+    const pane = this.#session?.panes[0] ?? null;
+    const isRunning = this.#capture !== null;
+    const hasPicture = pane?.frame != null;
+    Object.assign(this.#root.dataset, {
+      source: this.#capture?.kind ?? "",
+      state: this.#session === null ? (isRunning ? "opening" : "idle") : this.#isPaused ? "paused" : this.#worstState(),
+      session: pane?.resumed == null ? "" : pane.resumed ? "resumed" : "new",
+    });
+    element("welcome").hidden = isRunning;
+    element("panes").hidden = !isRunning;
+    this.#showConnection(pane);
+    for (const button of document.querySelectorAll(".toolbar [data-source]")) {
+      button.setAttribute("aria-pressed", String(/** @type {HTMLElement} */ (button).dataset.source === this.#capture?.kind));
+    }
+    for (const id of ["pause", "stop", "break"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !isRunning;
+    for (const id of ["snapshot", "record"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !hasPicture;
+    element("pause").textContent = this.#isPaused ? "Go on" : "Pause";
+    element("record").textContent = this.#recordings.size > 0 ? "Stop recording" : "Record";
+    element("record").setAttribute("aria-pressed", String(this.#recordings.size > 0));
+    if (!isRunning) element("stage").dataset.departure = "";
+    this.#form.camera = this.#camera;
+    element("map-hint").hidden = Boolean(this.#camera);
+    this.#showSnippet();
+  }
+
+  #worstState() {
+    const states = this.#session?.panes.map((pane) => pane.state) ?? [];
+    return ["failed", "ended", "reconnecting", "connecting"].find((state) => states.includes(/** @type {any} */ (state))) ?? "open";
+  }
+
+  /** @param {LanePane | null} pane */
+  #showConnection(pane) {
+    const state = pane === null ? "idle" : this.#worstState();
+    const connection = element("connection");
+    const why = pane?.reason ? `: ${pane.reason}` : "";
+    const attempt = pane && pane.attempt > 1 ? `, attempt ${pane.attempt}` : "";
+    const texts = /** @type {Record<string, string>} */ ({
+      open: pane?.resumed == null ? "Connected" : pane.resumed ? "Connected, same session" : "Connected, new session",
+      connecting: `Connecting${attempt}${why}`,
+      reconnecting: `Reconnecting${attempt}${why}`,
+    });
+    const text = texts[state] ?? "Not connected";
+    connection.dataset.state = state === "open" && pane?.resumed === false ? "new" : state;
+    connection.title = text;
+    const label = /** @type {HTMLElement} */ (connection.querySelector("span"));
+    if (label.textContent !== text) label.textContent = text;
+  }
+
+  #showSnippet() {
+    const { settings } = this.#form;
+    const [{ detector }] = this.#options;
+    const text = snippet(this.#language, {
+      url: BASE.href,
+      needsKey: this.#access.needsKey,
+      detector: detector ?? null,
+      settings,
+      camera: this.#camera,
+    });
+    const code = /** @type {HTMLElement} */ (element("snippet").querySelector("code"));
+    if (code.textContent !== text) code.textContent = text;
+  }
+
+  /** Asks which detectors the service has, which everyone may know. */
+  async #offerDetectors() {
+    try {
+      const response = await fetch(new URL("readyz", BASE));
+      if (!response.ok) return;
+      const { networks } = await response.json();
+      this.#form.offer(networks.map((/** @type {{detector: string}} */ network) => network.detector));
+    } catch {
+      // A service that can't be reached now offers all; connecting will say more.
+    }
+  }
+
+  /** @param {SourceKind} kind */
+  #choose(kind) {
+    if (kind === "file") element("file").click();
+    else void this.start(kind, kind === "demo" ? new URL("demo.webm", import.meta.url).href : null);
+  }
+
+  #wire() {
+    for (const button of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll("[data-source]"))) {
+      if (button instanceof HTMLButtonElement) button.addEventListener("click", () => this.#choose(/** @type {SourceKind} */ (button.dataset.source)));
+    }
+    const file = /** @type {HTMLInputElement} */ (element("file"));
+    file.addEventListener("change", () => {
+      const [video] = file.files ?? [];
+      file.value = "";
+      if (video) void this.start("file", video);
+    });
+    /** @type {Record<string, () => void>} */
+    const actions = {
+      "start-demo": () => this.#choose("demo"),
+      pause: () => this.togglePause(),
+      stop: () => void this.stop(),
+      snapshot: () => this.snapshot(),
+      record: () => void this.toggleRecording(),
+      break: () => this.breakConnection(),
+      theme: toggleTheme,
+      "help-open": () => /** @type {HTMLDialogElement} */ (element("help")).showModal(),
+      reset: () => this.#form.reset(),
+      copy: () => void copyText(element("snippet").textContent ?? "", element("copy")),
+      "copy-link": () => void copyText(location.href, element("copy-link")),
+    };
+    for (const [id, action] of Object.entries(actions)) element(id).addEventListener("click", action);
+    listenForShortcuts({
+      d: actions["start-demo"],
+      c: () => this.#choose("camera"),
+      f: () => this.#choose("file"),
+      " ": actions.pause,
+      s: actions.snapshot,
+      r: actions.record,
+      b: actions.break,
+      t: actions.theme,
+      escape: actions.stop,
+      "?": actions["help-open"],
+    });
+    this.#wireTabs();
+    this.#wireDrop();
+    addEventListener("hashchange", () => this.#form.replace(settingsFromHash(location.hash)));
+    addEventListener("resize", () => {
+      const pane = this.#session?.panes[0];
+      drawMap(element("map"), pane?.answer?.lanes ?? [], pane?.unseen ?? (() => 0));
+    });
+  }
+
+  #wireTabs() {
+    const tabs = LANGUAGES.map((language) => element(`tab-${language}`));
+    /** @param {number} index */
+    const select = (index) => {
+      this.#language = LANGUAGES[index];
+      tabs.forEach((tab, other) => {
+        tab.setAttribute("aria-selected", String(other === index));
+        tab.tabIndex = other === index ? 0 : -1;
+      });
+      element("snippet").setAttribute("aria-labelledby", tabs[index].id);
+      this.#showSnippet();
+    };
+    tabs.forEach((tab, index) => {
+      tab.addEventListener("click", () => select(index));
+      tab.addEventListener("keydown", ({ key }) => {
+        const step = { ArrowRight: 1, ArrowLeft: tabs.length - 1 }[key];
+        if (step === undefined) return;
+        const next = (index + step) % tabs.length;
+        select(next);
+        tabs[next].focus();
+      });
+    });
+  }
+
+  #wireDrop() {
+    const hint = element("drop-hint");
+    addEventListener("dragover", (event) => {
+      if (!event.dataTransfer?.types.includes("Files")) return;
+      event.preventDefault();
+      hint.hidden = false;
+    });
+    addEventListener("dragleave", (event) => {
+      if (event.relatedTarget === null) hint.hidden = true;
+    });
+    addEventListener("drop", (event) => {
+      event.preventDefault();
+      hint.hidden = true;
+      const [video] = event.dataTransfer?.files ?? [];
+      if (video) void this.start("file", video);
+    });
+  }
+}
+
+/**
+ * Copies text, and says so on the button for a moment.
+ * @param {string} text
+ * @param {HTMLElement} button
+ */
+async function copyText(text, button) {
+  const label = (button.dataset.label ??= button.textContent ?? "");
+  try {
+    await navigator.clipboard.writeText(text);
+    button.textContent = "Copied";
+  } catch {
+    button.textContent = "Select it and copy";
+  }
+  setTimeout(() => (button.textContent = label), 1500);
+}
+
+/** @param {number[]} ids */
+function list(ids) {
+  return ids.length < 2 ? ids.join("") : `${ids.slice(0, -1).join(", ")} and ${ids.at(-1)}`;
+}
+
+restoreTheme();
+new LivePage();
