@@ -231,9 +231,19 @@ class Settings(BaseSettings):
         description="API keys as printed by `lanestream key NAME`, NAME:SHA256; without any, every caller is accepted.",
     )
     api_keys_file: Path | None = Field(default=None, description="File with further API keys, one per line.")
+    token_secret: SecretStr | None = Field(
+        default=None,
+        min_length=32,
+        description="Secret of at least 32 characters that signs access tokens, the same on all replicas; if not set, "
+        "a random one, so that tokens are valid only for this process.",
+    )
+    token_s: float = Field(
+        default=600.0, ge=10.0, le=3600.0, description="Access tokens for web pages expire after this many seconds."
+    )
     allowed_origins: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)] = Field(
         default=(), description="Origins of other web pages that may use the service, such as https://example.com."
     )
+    live_page: bool = Field(default=True, description="Serve the live page at `/`.")
     metrics_access: Literal["keys", "open", "off"] = Field(
         default="keys", description="Who may read /metrics: `keys` callers with a key, `open` everyone, `off` no one."
     )

@@ -11,7 +11,7 @@ from fastapi.security import HTTPBearer
 from starlette.middleware.cors import CORSMiddleware
 
 from lanestream import __version__
-from lanestream.api import rest, websocket
+from lanestream.api import live_page, rest, websocket
 from lanestream.api.problems import install_error_handlers
 from lanestream.api.service import DrawLanes, Service
 from lanestream.workers.thread_pool import ThreadPool
@@ -72,3 +72,5 @@ def _include_routes(app: FastAPI, settings: Settings, *, with_keys: bool) -> Non
     elif settings.metrics_access == "open":
         app.include_router(rest.metrics_router)
     app.include_router(websocket.router)
+    if settings.live_page:
+        app.router.routes.extend(live_page.routes())

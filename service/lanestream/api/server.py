@@ -52,11 +52,17 @@ _CLOSE_S: Final = 0.5
 _SIGNALED: Final = 128
 
 
-def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None = None) -> None:
+def serve(
+    settings: Settings,
+    load: Callable[[], Engine],
+    draw: DrawLanes | None = None,
+    on_ready: Callable[[str], None] | None = None,
+) -> None:
     """Serves until a signal stops the process.
 
     `load` returns a warm engine. It is called once the server is running, in a thread or in worker processes, which
-    must be able to import it. Raises SettingsError if the address can't be listened on, and any error of `load`.
+    must be able to import it. `on_ready` is called once frames can be processed, in a thread, with a URL that reaches
+    the service from this machine. Raises SettingsError if the address can't be listened on, and any error of `load`.
     """
     # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
     cv2.setNumThreads(settings.opencv_threads)
@@ -67,7 +73,7 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None
     server = LanestreamServer(app, settings)
     app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     with server.stopping_on_signals(), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
-        runner.run(_serve(server, listener, app, load))
+        runner.run(_serve(server, listener, app, load, on_ready))
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -151,13 +157,19 @@ class LanestreamServer(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
+async def _serve(
+    server: uvicorn.Server,
+    listener: socket.socket,
+    app: FastAPI,
+    load: Callable[[], Engine],
+    on_ready: Callable[[str], None] | None,
+) -> None:
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     host, port = listener.getsockname()[:2]
     warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
     for conflict in package_conflicts():
         _log.warning("%s", conflict)
-    _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
+    _log.info("listening on %s, loading the networks", _http_url(host, port))
     starting = asyncio.create_task(_start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
     if not starting.done():  # a signal came first
@@ -171,6 +183,12 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
             network = info.model
             _log.info("detector %s: %s on %s (%s)", info.detector, network.name, network.provider, network.reason)
         _log.info("ready")
+        if on_ready is not None:
+            address = ipaddress.ip_address(host)
+            loopback = "127.0.0.1" if address.version == 4 else "::1"
+            reachable = loopback if address.is_unspecified else host
+            # A daemon: what it starts, such as a browser in a terminal, may go on for as long as it likes.
+            threading.Thread(target=on_ready, args=(_http_url(reachable, port),), daemon=True).start()
     except BaseException:
         server.should_exit = True
         await serving
@@ -178,6 +196,10 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
     cleaning = asyncio.create_task(_return_memory())
     await serving
     cleaning.cancel()
+
+
+def _http_url(host: str, port: int) -> str:
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 async def _return_memory() -> None:

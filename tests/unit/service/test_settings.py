@@ -247,6 +247,8 @@ def _row(name: str) -> str:
 def _shown(default: object) -> str:
     if isinstance(default, tuple):
         return ", ".join(default)
+    if isinstance(default, bool):
+        return str(default).lower()
     return "" if default is None else f"{default:.12g}" if isinstance(default, int | float) else str(default)
 
 
