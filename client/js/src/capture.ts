@@ -48,6 +48,10 @@ export function captureFrames(source: FrameSource, stream: LaneStream, options: 
       if (!stopped) {
         void stream.send(image, { timestamp: now / 1000 });
       }
+    } catch (error) {
+      // For example a video of another origin, whose pixels a page may not read.
+      stop();
+      throw error;
     } finally {
       encoding = false;
     }
@@ -66,6 +70,9 @@ export function captureFrames(source: FrameSource, stream: LaneStream, options: 
       stop();
     }
   });
+  if (stream.state === "ended" || stream.state === "failed") {
+    stop();
+  }
   return { stop };
 }
 

@@ -23,16 +23,18 @@ export function parseEndpoints(url: string | URL | readonly (string | URL)[]): E
 }
 
 function parseEndpoint(url: string | URL): Endpoint {
+  const text = String(url).trim();
+  const absolute = /^([./]|[a-z]+:\/\/)/i.test(text) ? text : `http://${text}`;
   let parts: URL;
   try {
     // In a page, a URL may be relative to it.
-    parts = new URL(url, globalThis.document?.baseURI);
+    parts = new URL(absolute, globalThis.document?.baseURI);
   } catch {
-    throw new LaneError("bad_settings", `${JSON.stringify(String(url))} is not a valid service URL`, URL_HINT);
+    throw new LaneError("bad_settings", `${JSON.stringify(text)} is not a valid service URL`, URL_HINT);
   }
   const scheme = HTTP_SCHEMES[parts.protocol];
   if (scheme === undefined || parts.username || parts.password) {
-    const problem = scheme === undefined ? `has the scheme ${parts.protocol}` : "has a login, which browsers do not send";
+    const problem = scheme === undefined ? `has the scheme ${parts.protocol}` : "has a login, which can't be sent";
     throw new LaneError("bad_settings", `the service URL ${problem}`, URL_HINT);
   }
   const path = parts.pathname.replace(/\/(v1\/stream)?$/, "");
@@ -69,12 +71,17 @@ export function refusalError(status: number, body: string, endpoint: Endpoint): 
   return new LaneError("connection_failed", `${endpoint.base} answered with status ${status}`, hint, { httpStatus: status });
 }
 
+/** Returns the origin of the page that this runs in; null outside of pages. */
+export function pageOrigin(): string | null {
+  return globalThis.location?.origin ?? null;
+}
+
 /** Returns the error for a request without a response. Browsers do not say why. */
 export function unreachableError(endpoint: Endpoint): LaneError {
-  const page = globalThis.location?.origin;
-  const foreign = page !== undefined && page !== "null" && new URL(endpoint.http).origin !== page;
-  const hint = foreign
-    ? `check the URL, that the service runs, and that its setting LANESTREAM_ALLOWED_ORIGINS has ${page}`
-    : "check the URL, and that the service runs";
+  const page = pageOrigin();
+  const hint =
+    page === null || new URL(endpoint.http).origin === page
+      ? "check the URL, and that the service runs"
+      : `check the URL, that the service runs, and that its setting LANESTREAM_ALLOWED_ORIGINS has ${page}`;
   return new LaneError("connection_failed", `the service at ${endpoint.base} can't be reached`, hint);
 }

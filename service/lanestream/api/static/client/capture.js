@@ -31,6 +31,11 @@ export function captureFrames(source, stream, options = {}) {
                 void stream.send(image, { timestamp: now / 1000 });
             }
         }
+        catch (error) {
+            // For example a video of another origin, whose pixels a page may not read.
+            stop();
+            throw error;
+        }
         finally {
             encoding = false;
         }
@@ -47,6 +52,9 @@ export function captureFrames(source, stream, options = {}) {
             stop();
         }
     });
+    if (stream.state === "ended" || stream.state === "failed") {
+        stop();
+    }
     return { stop };
 }
 function pictureOf(source) {

@@ -1,4 +1,4 @@
-import { keyHeaders, refusalError, unreachableError } from "./endpoint.js";
+import { keyHeaders, pageOrigin, refusalError, unreachableError } from "./endpoint.js";
 import { LaneError, timeoutError } from "./errors.js";
 const SUBPROTOCOL = "lanestream.v1";
 const KEY_SUBPROTOCOL = "bearer.";
@@ -21,12 +21,15 @@ export class Connection {
     #failure = null;
     #waiting = null;
     #deadline;
+    #signal;
+    #aborted = () => this.#fail(LaneError.from(this.#signal.reason));
     constructor(socket, signal) {
         this.#socket = socket;
+        this.#signal = signal;
         socket.onmessage = ({ data }) => this.#receive(data);
         socket.onclose = ({ code, reason }) => this.#fail(closedError(code, reason));
-        socket.onerror = null;
-        signal.addEventListener("abort", () => this.#fail(LaneError.from(signal.reason)), { once: true });
+        socket.onerror = ignore;
+        signal.addEventListener("abort", this.#aborted);
     }
     /**
      * Opens a WebSocket within `timeoutS` seconds. Throws LaneError with the reason if that fails, and the reason of
@@ -35,7 +38,7 @@ export class Connection {
     static async open(endpoint, key, platform, timeoutS, signal) {
         signal.throwIfAborted();
         const subprotocols = key === null ? [SUBPROTOCOL] : [SUBPROTOCOL, KEY_SUBPROTOCOL + key];
-        const socket = new platform.WebSocket(endpoint.stream, subprotocols);
+        const socket = createSocket(endpoint, subprotocols, platform);
         const outcome = await opened(socket, timeoutS, signal);
         if (outcome === "opened") {
             return new Connection(socket, signal);
@@ -100,9 +103,19 @@ export class Connection {
         }
         this.#failure = error;
         clearTimeout(this.#deadline);
+        this.#signal.removeEventListener("abort", this.#aborted);
         abandon(this.#socket);
         this.#waiting?.reject(error);
         this.#waiting = null;
+    }
+}
+function createSocket(endpoint, subprotocols, platform) {
+    try {
+        return new platform.WebSocket(endpoint.stream, subprotocols);
+    }
+    catch (error) {
+        const hint = "a page that was loaded over https can only use a service with https";
+        throw new LaneError("bad_settings", `no WebSocket to ${endpoint.base} can be created: ${String(error)}`, hint);
     }
 }
 /** Waits until a socket is open, closed or late. */
@@ -125,15 +138,20 @@ function opened(socket, timeoutS, signal) {
 /** Closes a socket whose events no longer matter. The peer may be gone, so its reply is not awaited. */
 function abandon(socket) {
     socket.onopen = socket.onmessage = socket.onclose = null;
-    // Some implementations report an error that nobody handles as an uncaught one.
-    socket.onerror = () => { };
+    socket.onerror = ignore;
     socket.close();
 }
+/** Handles the error events of a socket: outside of browsers, those that nobody handles may end the process. */
+function ignore() { }
 /** Asks over HTTP why a handshake failed: browsers do not say. */
 async function refusalReason(endpoint, key, platform, timeoutS, signal) {
-    const probe = { headers: keyHeaders(key), signal: AbortSignal.any([signal, AbortSignal.timeout(1000 * timeoutS)]) };
+    // Browsers name the origin of the page only in requests to other origins.
+    const origin = pageOrigin();
+    const query = origin === null ? "" : `?origin=${encodeURIComponent(origin)}`;
+    const deadline = AbortSignal.any([signal, AbortSignal.timeout(1000 * timeoutS)]);
+    const request = { headers: keyHeaders(key), signal: deadline, cache: "no-store" };
     try {
-        const response = await platform.fetch(`${endpoint.http}/v1/stream`, probe);
+        const response = await platform.fetch(`${endpoint.http}/v1/stream${query}`, request);
         const body = await response.text();
         if (response.status !== UPGRADE_REQUIRED) {
             return refusalError(response.status, body, endpoint);
