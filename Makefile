@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types lock asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -33,7 +33,7 @@ serve: $(RUN_READY)
 train-toy: $(DEV_READY)
 	$(BIN)/python tools/train_toy.py
 
-test: $(DEV_READY)
+test: $(DEV_READY) $(JS_READY)
 	$(BIN)/python -m pytest
 
 lint: $(DEV_READY)
@@ -41,6 +41,20 @@ lint: $(DEV_READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The client for browsers and Node. Its modules for the live page are in the repository.
+PAGE_CLIENT := service/lanestream/api/static/client
+JS_READY := client/js/node_modules/.ready
+
+js: $(JS_READY)
+	cd client/js && npm run --silent build
+	rm -rf $(PAGE_CLIENT)
+	mkdir -p $(PAGE_CLIENT)
+	cp client/js/dist/*.js $(PAGE_CLIENT)
+
+# Its types of messages, from the service's JSON Schemas.
+js-types: $(JS_READY) $(DEV_READY)
+	$(BIN)/python tools/js_types.py
 
 MODELS := service/lanestream/models
 
@@ -153,3 +167,9 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,dev]'
 	@touch $@ $(RUN_READY)
+
+$(JS_READY): client/js/package-lock.json
+	@command -v npm >/dev/null || { echo "error: no npm (on Debian: apt install nodejs npm)" >&2; exit 1; }
+	cd client/js && npm ci --silent --ignore-scripts || \
+	  { echo "error: the packages of client/js could not be installed: npm ci needs the npm registry" >&2; exit 1; }
+	@touch $@
