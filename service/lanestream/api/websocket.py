@@ -23,6 +23,7 @@ from lanestream.errors import (
     LanestreamError,
     NoDetectorError,
     ProtocolError,
+    UnauthorizedError,
     WorkerLostError,
     wire_status,
 )
@@ -100,7 +101,7 @@ class StreamConnection:
             self._connection.identify(caller.quota)
 
     def wake(self) -> None:
-        """Makes the watcher check the time limits, and whether the service is draining."""
+        """Makes the watcher check the time limits, and whether the stream must end."""
         self._wake_watcher.set()
 
     async def run(self) -> None:
@@ -318,7 +319,7 @@ class StreamConnection:
         self._service.sessions.schedule_save(session)
 
     async def _watch(self) -> None:
-        """Raises the error that ends an idle, too old or evicted stream. Announces a drain of the service."""
+        """Raises the error that ends an idle, too old, evicted or no longer allowed stream. Announces a drain."""
         while not self._service.draining:
             try:
                 async with asyncio.timeout(max(self._seconds_to_next_limit(), _MIN_WATCH_S)):
@@ -332,6 +333,8 @@ class StreamConnection:
                 raise EvictedError(
                     "the session was resumed over another socket", "use a resume token on one socket at a time"
                 )
+            if not self._service.authenticator.knows(self._caller):
+                raise UnauthorizedError("the API key of this stream was removed", "use another key")
         token = None if self._session is None else self._session.token
         self._protocol.drain(token, self._service.settings.drain_s)
         await self._send_pending()
