@@ -178,7 +178,8 @@ async def _serve(
     warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
     for conflict in package_conflicts():
         _log.warning("%s", conflict)
-    _log.info("listening on %s, loading the networks", _http_url(host, port))
+    url = _http_url(host, port)
+    _log.info("listening on %s, loading the networks", url, extra={"event": "listening", "url": url})
     starting = asyncio.create_task(_start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
     if not starting.done():  # a signal came first
@@ -190,8 +191,17 @@ async def _serve(
         app.state.service.install(pool)
         for info in pool.capabilities.detectors:
             network = info.model
-            _log.info("detector %s: %s on %s (%s)", info.detector, network.name, network.provider, network.reason)
-        _log.info("ready")
+            _log.info(
+                "detector %s: %s on %s (%s)",
+                *(info.detector, network.name, network.provider, network.reason),
+                extra={
+                    "event": "detector_loaded",
+                    "detector": info.detector,
+                    "model": network.name,
+                    "provider": network.provider,
+                },
+            )
+        _log.info("ready", extra={"event": "ready"})
         if on_ready is not None:
             address = ipaddress.ip_address(host)
             loopback = "127.0.0.1" if address.version == 4 else "::1"

@@ -122,12 +122,13 @@ class Service:
         try:
             changed = self.authenticator.with_keys_of(self.settings)
         except SettingsError as error:
-            _log.error("the API keys stay as they were: %s", error)
+            _log.error("the API keys stay as they were: %s", error, extra={"event": "keys_refused"})
             return
         if changed == self.authenticator:
             return
         self.authenticator = changed
-        _log.info("the API keys have changed: there are %d", len(changed.keys))
+        count = len(changed.keys)
+        _log.info("the API keys have changed: there are %d", count, extra={"event": "keys_changed", "keys": count})
         for stream in self.streams:
             stream.wake()
 
