@@ -146,8 +146,8 @@ COMPOSE = $(ENGINE) compose -f docker/compose.yaml --profile $(VARIANT)
 up: image
 	docker/make-secrets $(ENGINE) run --rm lanestream:$(VARIANT)
 	$(COMPOSE) up --detach --wait
-	@echo 'service: http://127.0.0.1:8000, key in docker/secrets/local_key'
-	@echo 'dashboard: http://127.0.0.1:3000, user admin, password in docker/secrets/grafana_password'
+	@echo "service: http://$${LANESTREAM_PUBLISH:-127.0.0.1:8000}, key in docker/secrets/local_key"
+	@echo "dashboard: http://$${GRAFANA_PUBLISH:-127.0.0.1:3000}, user admin, password in docker/secrets/grafana_password"
 
 down:
 	$(COMPOSE) down

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import json
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from lanestream.api.connections import ConnectionLimits, ConnectionTable, connec
 from lanestream.api.metrics import Metrics
 from lanestream.api.request_body import BodyLimits, BodyReader
 from lanestream.asyncapi import document
-from lanestream.errors import DrainingError, NotReadyError
+from lanestream.errors import DrainingError, NotReadyError, SettingsError
 from lanestream.protocol import Limits, json_schemas, read_camera_file
 from lanestream.session import SessionOptions
 from lanestream.streaming.session_registry import SessionRegistry
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from lanestream.settings import Settings
     from lanestream.streaming.session_registry import Caller
     from lanestream.workers.pool import WorkerPool
+
+_log = logging.getLogger(__name__)
 
 DrawLanes = Callable[["Image", "LanesMessage"], "Image"]
 
@@ -47,7 +50,7 @@ class OpenStream(Protocol):
     """An open stream, as the service sees it."""
 
     def wake(self) -> None:
-        """Makes the stream check whether the service is draining."""
+        """Makes the stream check whether it must end: the service may be draining, or the caller's key be gone."""
 
 
 class Service:
@@ -113,6 +116,21 @@ class Service:
         """Raises NotReadyError if worker processes that end are no longer replaced."""
         if self._pool is not None and self._pool.upkeep_failed:
             raise NotReadyError("worker processes are no longer replaced", "restart the service; its log has the cause")
+
+    def reload_keys(self) -> None:
+        """Reads the file of API keys again. Streams of callers whose keys are gone end; a bad file changes nothing."""
+        try:
+            changed = self.authenticator.with_keys_of(self.settings)
+        except SettingsError as error:
+            _log.error("the API keys stay as they were: %s", error, extra={"event": "keys_refused"})
+            return
+        if changed == self.authenticator:
+            return
+        self.authenticator = changed
+        count = len(changed.keys)
+        _log.info("the API keys have changed: there are %d", count, extra={"event": "keys_changed", "keys": count})
+        for stream in self.streams:
+            stream.wake()
 
     def session_options(self, message: StartMessage) -> SessionOptions:
         """Returns the options of the session that `message` opens. Raises ProtocolError if they are contradictory."""
