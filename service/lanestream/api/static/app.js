@@ -26,6 +26,7 @@ const BASE = new URL(".", location.href);
 // A page that nobody closes waits for its service for an hour.
 const RECONNECT_S = 3600;
 const SAME_ERROR_MS = 5000;
+const BOTH = /** @type {("candidates" | "regression")[]} */ (["candidates", "regression"]);
 const LANGUAGES = /** @type {const} */ (["curl", "python", "javascript"]);
 
 /**
@@ -76,7 +77,7 @@ class LivePage {
   /** The options of `start` for each stream. */
   get #options() {
     const { settings } = this.#form;
-    const detectors = settings.detector === "both" ? ["candidates", "regression"] : [settings.detector];
+    const detectors = settings.detector === "both" ? BOTH : [settings.detector];
     return detectors.map((detector) => streamOptions(settings, this.#camera, detector));
   }
 

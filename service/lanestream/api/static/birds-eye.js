@@ -2,6 +2,8 @@
 
 import { lineStyle } from "./lane-styles.js";
 
+/** @typedef {import("./client/index.js").LaneModel} LaneModel */
+
 // The part of the road that the map shows in meters: ahead, behind and on either side of the vehicle.
 const AHEAD = 45;
 const BEHIND = 5;
@@ -18,8 +20,8 @@ const TICK_M = 0.6;
 /**
  * Draws the lanes that have meters, and nothing but the grid if none has.
  * @param {HTMLCanvasElement} canvas
- * @param {any[]} lanes
- * @param {(lane: any) => number} unseen seconds since a boundary was last detected
+ * @param {LaneModel[]} lanes
+ * @param {(lane: LaneModel) => number} unseen seconds since a boundary was last detected
  */
 export function drawMap(canvas, lanes, unseen) {
   const ratio = window.devicePixelRatio || 1;
@@ -78,17 +80,18 @@ function drawGrid({ context, row }, width) {
 }
 
 /**
- * @param {any} lane
- * @param {number} x
+ * Returns how far left of the vehicle a boundary is that has meters.
+ * @param {LaneModel} lane
+ * @param {number} x ahead
  */
 function lateral(lane, x) {
-  const [a, b, c] = lane.ground;
+  const [a, b, c] = /** @type {[number, number, number]} */ (lane.ground);
   return a * x * x + b * x + c;
 }
 
 /**
  * @param {RoadMap} map
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {import("./lane-styles.js").LineStyle} style
  */
 function drawBand({ context, column, row }, lane, style) {
@@ -112,7 +115,7 @@ function drawBand({ context, column, row }, lane, style) {
 
 /**
  * @param {RoadMap} map
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {import("./lane-styles.js").LineStyle} style
  */
 function drawLine({ context, column, row }, lane, style) {

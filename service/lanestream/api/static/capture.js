@@ -22,6 +22,7 @@ import { Problem, captureProblem, insecureProblem, videoProblem } from "./proble
 
 // A video that presents no frame for this long is looked at by the worker's timer, for example in a hidden page.
 const SILENCE_MS = 150;
+const USUAL_FRAME_S = 1 / 30;
 
 /** A running source. */
 export class Capture {
@@ -35,7 +36,6 @@ export class Capture {
   // Times of a video that starts again go on.
   #offset = 0;
   #lastTime = -1;
-  #taken = -1;
   #presented = { at: -Infinity, time: 0, isNew: false };
   // Whether the worker waits for a frame that the video has yet to present.
   #isAsked = false;
@@ -181,18 +181,16 @@ export class Capture {
   async #reply() {
     const video = /** @type {HTMLVideoElement} */ (this.#video);
     const isWatched = performance.now() - this.#presented.at < SILENCE_MS;
-    const time = isWatched ? this.#presented.time : video.currentTime;
-    this.#isAsked = isWatched ? !this.#presented.isNew : time === this.#taken;
+    this.#isAsked = isWatched ? !this.#presented.isNew : video.currentTime === this.#lastTime;
     if (this.#isAsked) return;
     this.#presented.isNew = false;
-    this.#taken = time;
     const captured = performance.timeOrigin + (isWatched ? this.#presented.at : performance.now());
-    if (time < this.#lastTime) this.#offset += this.#lastTime - time + 1 / 30;
-    this.#lastTime = time;
-    const timestamp = time + this.#offset;
-    // A VideoFrame refers to the decoded picture and copies nothing. It needs a secure context.
+    // A VideoFrame refers to the decoded picture, copies nothing and knows its time. It needs a secure context.
     const source = "VideoFrame" in window ? new VideoFrame(video) : await createImageBitmap(video);
-    this.#worker.postMessage({ type: "frame", source, captured, timestamp }, [source]);
+    const time = "timestamp" in source ? source.timestamp / 1e6 : isWatched ? this.#presented.time : video.currentTime;
+    if (time < this.#lastTime) this.#offset += this.#lastTime - time + USUAL_FRAME_S;
+    this.#lastTime = time;
+    this.#worker.postMessage({ type: "frame", source, captured, timestamp: time + this.#offset }, [source]);
   }
 }
 

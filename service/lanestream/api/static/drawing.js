@@ -7,6 +7,9 @@
 import { laneX } from "./client/index.js";
 import { EGO_LANE, lineStyle, positionColor } from "./lane-styles.js";
 
+/** @typedef {import("./client/index.js").LaneModel} LaneModel */
+/** @typedef {import("./client/index.js").LanesMessage} LanesMessage */
+
 const SAMPLES = 40;
 const FORESHORTENING = 1.6;
 const CORE = 0.45;
@@ -18,8 +21,8 @@ const DARK = "rgba(12, 16, 20, 0.85)";
  * Draws a frame and its lanes; without an answer, the frame alone.
  * @param {CanvasRenderingContext2D} context
  * @param {ImageBitmap} picture
- * @param {any} answer the `lanes` message of this very frame
- * @param {(lane: any) => number} unseen seconds since a boundary was last detected
+ * @param {LanesMessage | null} answer the `lanes` message of this very frame
+ * @param {(lane: LaneModel) => number} unseen seconds since a boundary was last detected
  */
 export function drawFrame(context, picture, answer, unseen) {
   context.setTransform(1, 0, 0, 1, 0, 0);
@@ -60,11 +63,11 @@ export function drawHorizon(context, fraction) {
 /**
  * Fills the ego lane where both of its boundaries are reported, fading out with distance.
  * @param {CanvasRenderingContext2D} context
- * @param {any} answer
+ * @param {LanesMessage} answer
  */
 function fillEgoLane(context, answer) {
-  const left = answer.lanes.find((/** @type {any} */ lane) => lane.track_id === answer.ego.left);
-  const right = answer.lanes.find((/** @type {any} */ lane) => lane.track_id === answer.ego.right);
+  const left = answer.lanes.find((lane) => lane.track_id === answer.ego.left);
+  const right = answer.lanes.find((lane) => lane.track_id === answer.ego.right);
   if (!left || !right) return;
   const bottom = Math.min(left.line.bottom[1], right.line.bottom[1]);
   const top = Math.max(left.line.top[1], right.line.top[1]);
@@ -84,9 +87,9 @@ function fillEgoLane(context, answer) {
 
 /**
  * @param {CanvasRenderingContext2D} context
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {import("./lane-styles.js").LineStyle} style
- * @param {any} answer
+ * @param {LanesMessage} answer
  * @param {number} scale
  */
 function drawBoundary(context, lane, style, answer, scale) {
@@ -109,7 +112,7 @@ function drawBoundary(context, lane, style, answer, scale) {
 
 /**
  * Returns the row at a share of a boundary's length. Equal shares get shorter with distance, as on a road.
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {number} share
  */
 function rowAt(lane, share) {
@@ -118,7 +121,7 @@ function rowAt(lane, share) {
 }
 
 /**
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {number} y
  * @param {{height: number, scale: number}} road
  */
@@ -129,7 +132,7 @@ function halfWidth(lane, y, road) {
 
 /**
  * @param {CanvasRenderingContext2D} context
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {number[]} rows
  * @param {{middle: number, width: number}} strand
  * @param {string} color
@@ -157,7 +160,7 @@ function fillRibbon(context, lane, rows, strand, color, rim, road) {
 /**
  * Draws short ticks along a road edge, away from the vehicle.
  * @param {CanvasRenderingContext2D} context
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {import("./lane-styles.js").LineStyle} style
  * @param {{height: number, scale: number}} road
  */
@@ -179,8 +182,8 @@ function drawTicks(context, lane, style, road) {
 /**
  * Writes the track id on a small label, a third of the way up the boundary.
  * @param {CanvasRenderingContext2D} context
- * @param {any} lane
- * @param {any} answer
+ * @param {LaneModel} lane
+ * @param {LanesMessage} answer
  * @param {number} scale
  */
 function drawLabel(context, lane, answer, scale) {

@@ -1,5 +1,7 @@
 /** How boundaries are drawn: their shape shows what they are, their color where they are. */
 
+/** @typedef {import("./client/index.js").LaneModel} LaneModel */
+
 /** Colors that people with any kind of color blindness can tell apart (Okabe and Ito). */
 const POSITIONS = new Map([
   [-2, { color: "#cc79a7", name: "next left" }],
@@ -44,7 +46,7 @@ export function positionName(position) {
 
 /**
  * Returns what a boundary is, such as "dashed white".
- * @param {any} lane
+ * @param {LaneModel} lane
  */
 export function lineName(lane) {
   if (lane.kind === "road_edge") return "road edge";
@@ -53,7 +55,7 @@ export function lineName(lane) {
 
 /**
  * Returns how a boundary is drawn that was last detected `unseen` seconds ago.
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {number} unseen
  * @returns {LineStyle}
  */
@@ -73,7 +75,7 @@ export function lineStyle(lane, unseen) {
 }
 
 /**
- * @param {any} lane
+ * @param {LaneModel} lane
  * @param {number} unseen
  */
 function strength(lane, unseen) {

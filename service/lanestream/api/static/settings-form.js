@@ -83,7 +83,8 @@ export class SettingsForm {
         const both = /** @type {const} */ (["marking", "road_edge"]);
         const kinds = both.filter((kind) => this.#input(kind).checked);
         // At least one kind is reported.
-        settings.kinds = kinds.length === 0 ? [input.name === "marking" ? "road_edge" : "marking"] : kinds;
+        const [first = input.name === "marking" ? "road_edge" : "marking", ...others] = kinds;
+        settings.kinds = [first, ...others];
         break;
       }
       case "horizon_auto":

@@ -3,10 +3,11 @@
 /**
  * @typedef {object} Settings
  * @property {"candidates" | "regression" | "both" | null} detector null for the service's default
- * @property {("marking" | "road_edge")[] | null} kinds null for the service's setting
+ * @property {[Kind, ...Kind[]] | null} kinds null for the service's setting
  * @property {number | null} horizon as a fraction of the picture's height; null to estimate it
  * @property {{height: number, fov: number} | null | undefined} camera meters and degrees; null for none, undefined for
  *   that of the source, if it is known
+ * @typedef {"marking" | "road_edge"} Kind
  * @typedef {"curl" | "python" | "javascript"} Language
  */
 
@@ -61,19 +62,19 @@ export function hashFromSettings(settings) {
 }
 
 /**
- * Returns the options of `start` for a stream with these settings.
+ * Returns the options of `start` for a stream with these settings. Those that are undefined have their defaults.
  * @param {Settings} settings
  * @param {Settings["camera"]} camera the one in use
- * @param {string | null} detector the stream's own, if there are two
+ * @param {"candidates" | "regression" | null} detector the stream's own
+ * @returns {import("./client/index.js").StreamOptions}
  */
 export function streamOptions(settings, camera, detector) {
-  /** @type {Record<string, unknown>} */
-  const options = {};
-  if (detector !== null) options.detector = detector;
-  if (settings.kinds !== null) options.kinds = settings.kinds;
-  if (settings.horizon !== null) options.horizon = settings.horizon;
-  if (camera) options.camera = { height: camera.height, field_of_view: camera.fov };
-  return options;
+  return {
+    detector: detector ?? undefined,
+    kinds: settings.kinds ?? undefined,
+    horizon: settings.horizon ?? undefined,
+    camera: camera ? { height: camera.height, field_of_view: camera.fov } : undefined,
+  };
 }
 
 /**
