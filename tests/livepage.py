@@ -22,11 +22,17 @@ class LivePage:
     def __init__(self, page: Page) -> None:
         self.page = page
         self.requests: list[str] = []
+        self._hosts: set[str] = set()
         page.on("request", self._note)
 
     def open(self, url: str, settings: str = "") -> None:
         """Opens the page of the service at `url` with `settings` in its hash, such as `#detector=regression`."""
+        self._hosts.add(urlsplit(url).netloc)
         self.page.goto(f"{url}/{settings}")
+
+    def leave(self) -> None:
+        """Leaves the page, so that it does not notice that its service stops."""
+        self.page.goto("about:blank")
 
     def attribute(self, name: str) -> str:
         """Returns an attribute of the page's state, `source`, `state`, `session`, `drawn` and others; "" if missing."""
@@ -66,8 +72,12 @@ class LivePage:
         self.wait("both ego boundaries", lambda: len(self.shown("ego").split()) == 2)
 
     def pause(self) -> None:
-        """Pauses, and returns once no answers are drawn any more."""
+        """Pauses, and returns once the last answers are drawn."""
         self.page.locator("#pause").click()
+        self.wait_until_quiet()
+
+    def wait_until_quiet(self) -> None:
+        """Returns once no answers are drawn any more."""
         before = -1
         while self.drawn != before:
             before = self.drawn
@@ -85,9 +95,9 @@ class LivePage:
         return np.asarray(image, np.uint8)
 
     def foreign_requests(self) -> list[str]:
-        """Returns the addresses that were requested from other hosts than the page's own."""
-        own = urlsplit(self.page.url).netloc
-        return [url for url in self.requests if urlsplit(url).scheme not in ("blob", "data") and urlsplit(url).netloc != own]
+        """Returns the addresses that were requested from other hosts than those that were opened."""
+        addresses = [url for url in self.requests if urlsplit(url).scheme in ("http", "https", "ws", "wss")]
+        return [url for url in addresses if urlsplit(url).netloc not in self._hosts]
 
     def _note(self, request: Request) -> None:
         self.requests.append(request.url)

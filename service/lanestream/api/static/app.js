@@ -122,7 +122,6 @@ class LivePage {
   togglePause() {
     if (this.#capture === null) return;
     this.#isPaused = !this.#isPaused;
-    this.#capture.paused = this.#isPaused;
     this.#show();
   }
 
@@ -220,11 +219,9 @@ class LivePage {
     if (error.code === "unauthorized") {
       this.#session?.close();
       const reason = this.#access.token === null ? "" : "The token has expired or is not valid any more. Enter the key again.";
-      if (this.#capture) this.#capture.paused = true;
       const hasToken = await this.#access.ask(reason);
       this.#show();
       if (hasToken && this.#capture) {
-        this.#capture.paused = this.#isPaused;
         this.#connect();
         return;
       }
@@ -292,17 +289,19 @@ class LivePage {
 
   /** Shows the state of everything but the answers. */
   #show() {
-    const pane = this.#session?.panes[0] ?? null;
+    const worst = this.#worstPane;
     const isRunning = this.#capture !== null;
-    const hasPicture = pane?.frame != null;
+    const hasPicture = this.#session?.panes[0].frame != null;
+    const state = worst?.state ?? (isRunning ? "opening" : "idle");
+    if (this.#capture) this.#capture.paused = this.#isPaused || state !== "open";
     Object.assign(this.#root.dataset, {
       source: this.#capture?.kind ?? "",
-      state: this.#session === null ? (isRunning ? "opening" : "idle") : this.#isPaused ? "paused" : this.#worstState(),
-      session: pane?.resumed == null ? "" : pane.resumed ? "resumed" : "new",
+      state: this.#isPaused && state === "open" ? "paused" : state,
+      session: worst?.resumed == null ? "" : worst.resumed ? "resumed" : "new",
     });
     element("welcome").hidden = isRunning;
     element("panes").hidden = !isRunning;
-    this.#showConnection(pane);
+    this.#showConnection(worst);
     for (const button of document.querySelectorAll(".toolbar [data-source]")) {
       button.setAttribute("aria-pressed", String(/** @type {HTMLElement} */ (button).dataset.source === this.#capture?.kind));
     }
@@ -317,14 +316,16 @@ class LivePage {
     this.#showSnippet();
   }
 
-  #worstState() {
-    const states = this.#session?.panes.map((pane) => pane.state) ?? [];
-    return ["failed", "ended", "reconnecting", "connecting"].find((state) => states.includes(/** @type {any} */ (state))) ?? "open";
+  /** The pane with the worst connection, which stands for all. */
+  get #worstPane() {
+    const order = ["failed", "ended", "reconnecting", "connecting", "open"];
+    const panes = this.#session?.panes ?? [];
+    return panes.toSorted((a, b) => order.indexOf(a.state) - order.indexOf(b.state))[0] ?? null;
   }
 
   /** @param {LanePane | null} pane */
   #showConnection(pane) {
-    const state = pane === null ? "idle" : this.#worstState();
+    const state = pane?.state ?? "idle";
     const connection = element("connection");
     const why = pane?.reason ? `: ${pane.reason}` : "";
     const attempt = pane && pane.attempt > 1 ? `, attempt ${pane.attempt}` : "";

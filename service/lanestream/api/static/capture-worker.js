@@ -60,7 +60,7 @@ class FrameEncoder {
     if (message.type === "pull") setInterval(() => this.#isReady() && self.postMessage({ type: "tick" }), TICK_MS);
     if (message.type === "frame") void this.#encode(message.source, message.captured, message.timestamp);
     if (message.type === "plan") this.#plan = message.plan;
-    if (message.type === "pause") this.#isPaused = message.paused;
+    if (message.type === "pause") this.#isPaused = message.isPaused;
     if (message.type === "room") this.#hasRoom = message.hasRoom;
     this.#takeWaiting();
   }

@@ -22,7 +22,6 @@ import { Problem, captureProblem, insecureProblem, videoProblem } from "./proble
 
 // A video that presents no frame for this long is looked at by the worker's timer, for example in a hidden page.
 const SILENCE_MS = 150;
-const USUAL_FRAME_S = 1 / 30;
 
 /** A running source. */
 export class Capture {
@@ -39,6 +38,7 @@ export class Capture {
   #presented = { at: -Infinity, time: 0, isNew: false };
   // Whether the worker waits for a frame that the video has yet to present.
   #isAsked = false;
+  #isPaused = false;
   #isOver = false;
 
   /**
@@ -77,12 +77,14 @@ export class Capture {
     this.#worker.postMessage({ type: "room", hasRoom });
   }
 
-  /** @param {boolean} paused */
-  set paused(paused) {
-    this.#worker.postMessage({ type: "pause", paused });
+  /** @param {boolean} isPaused whether no frames are wanted now; a video file stands still meanwhile */
+  set paused(isPaused) {
+    if (isPaused === this.#isPaused) return;
+    this.#isPaused = isPaused;
+    this.#worker.postMessage({ type: "pause", isPaused });
     if (this.#video === null || this.#stream !== null) return;
-    if (paused) this.#video.pause();
-    else void this.#video.play();
+    if (isPaused) this.#video.pause();
+    else void play(this.#video);
   }
 
   close() {
@@ -163,7 +165,7 @@ export class Capture {
   /** @param {HTMLVideoElement} video */
   async #play(video) {
     if ("requestVideoFrameCallback" in video) this.#watch(video);
-    await video.play();
+    await play(video);
     this.#worker.postMessage({ type: "pull" });
   }
 
@@ -181,16 +183,44 @@ export class Capture {
   async #reply() {
     const video = /** @type {HTMLVideoElement} */ (this.#video);
     const isWatched = performance.now() - this.#presented.at < SILENCE_MS;
-    this.#isAsked = isWatched ? !this.#presented.isNew : video.currentTime === this.#lastTime;
+    const isNew = isWatched ? this.#presented.isNew : video.currentTime !== this.#lastTime;
+    this.#isAsked = !isNew;
     if (this.#isAsked) return;
     this.#presented.isNew = false;
     const captured = performance.timeOrigin + (isWatched ? this.#presented.at : performance.now());
-    // A VideoFrame refers to the decoded picture, copies nothing and knows its time. It needs a secure context.
-    const source = "VideoFrame" in window ? new VideoFrame(video) : await createImageBitmap(video);
+    const source = await pictureOf(video);
+    if (source === null) {
+      this.#isAsked = true;
+      return;
+    }
     const time = "timestamp" in source ? source.timestamp / 1e6 : isWatched ? this.#presented.time : video.currentTime;
-    if (time < this.#lastTime) this.#offset += this.#lastTime - time + USUAL_FRAME_S;
+    if (time < this.#lastTime) this.#offset += Number.isFinite(video.duration) ? video.duration : this.#lastTime;
     this.#lastTime = time;
     this.#worker.postMessage({ type: "frame", source, captured, timestamp: time + this.#offset }, [source]);
+  }
+}
+
+/**
+ * Returns what a video shows; null if it shows nothing at the moment, for example while it starts again.
+ * @param {HTMLVideoElement} video
+ */
+async function pictureOf(video) {
+  try {
+    // A VideoFrame refers to the decoded picture, copies nothing and knows its time. It needs a secure context.
+    return "VideoFrame" in window ? new VideoFrame(video) : await createImageBitmap(video);
+  } catch (error) {
+    if (error instanceof DOMException && error.name === "InvalidStateError") return null;
+    throw error;
+  }
+}
+
+/** @param {HTMLVideoElement} video */
+async function play(video) {
+  try {
+    await video.play();
+  } catch (error) {
+    // A pause or the end that came while it was about to start.
+    if (!(error instanceof DOMException && error.name === "AbortError")) throw error;
   }
 }
 
