@@ -307,7 +307,7 @@ class LivePage {
     }
     for (const id of ["pause", "stop", "break"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !isRunning;
     for (const id of ["snapshot", "record"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !hasPicture;
-    element("pause").textContent = this.#isPaused ? "Go on" : "Pause";
+    element("pause").textContent = this.#isPaused ? "Resume" : "Pause";
     element("record").textContent = this.#recordings.size > 0 ? "Stop recording" : "Record";
     element("record").setAttribute("aria-pressed", String(this.#recordings.size > 0));
     if (!isRunning) element("stage").dataset.departure = "";

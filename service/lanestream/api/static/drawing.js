@@ -23,8 +23,9 @@ const DARK = "rgba(12, 16, 20, 0.85)";
  * @param {ImageBitmap} picture
  * @param {LanesMessage | null} answer the `lanes` message of this very frame
  * @param {(lane: LaneModel) => number} unseen seconds since a boundary was last detected
+ * @param {number} shownWidth of the canvas on the page; on a small one, lines and labels are relatively larger
  */
-export function drawFrame(context, picture, answer, unseen) {
+export function drawFrame(context, picture, answer, unseen, shownWidth) {
   context.setTransform(1, 0, 0, 1, 0, 0);
   context.globalAlpha = 1;
   context.drawImage(picture, 0, 0);
@@ -32,7 +33,7 @@ export function drawFrame(context, picture, answer, unseen) {
   // Pixel centers are at integers in answers, and at halves on a canvas.
   const zoom = picture.width / answer.width;
   context.setTransform(zoom, 0, 0, zoom, 0.5 * zoom, 0.5 * zoom);
-  const scale = Math.max(0.4, answer.width / 1280);
+  const scale = answer.width / Math.min(1280, Math.max(320, 1.5 * shownWidth));
   fillEgoLane(context, answer);
   for (const lane of answer.lanes) drawBoundary(context, lane, lineStyle(lane, unseen(lane)), answer, scale);
   for (const lane of answer.lanes) drawLabel(context, lane, answer, scale);

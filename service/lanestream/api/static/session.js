@@ -28,8 +28,10 @@ import { Pacing } from "./pacing.js";
  * @property {() => void} onPlan
  */
 
-// One frame that the service processes, and one on its way. More would only make the answers older.
+// One frame that the service processes, and one that comes when it is done. More would only make the answers older.
 const MOST_UNANSWERED = 2;
+// The share of the newest frame in the expected times.
+const NEWEST = 0.2;
 
 /** One stream and its canvas. */
 export class LanePane {
@@ -58,6 +60,9 @@ export class LanePane {
   /** @type {{ids: number[], at: number} | null} what was tracked when the connection was lost, and when that was */
   #lost = null;
   #isRestarting = false;
+  #shownWidth = 1280;
+  // How much longer the service usually takes for a frame than the page for the next one.
+  #pauseMs = 0;
 
   /**
    * @param {LaneClient} client
@@ -71,6 +76,8 @@ export class LanePane {
     this.#context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d", { alpha: false }));
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", `The picture with its lanes${options.detector ? `, detector ${options.detector}` : ""}`);
+    // Asking for the width at every frame would have the browser lay out the page each time.
+    new ResizeObserver(([{ contentRect }]) => (this.#shownWidth = contentRect.width)).observe(this.canvas);
     this.#stream = client.stream({ ...options, mode: "latest" });
     this.#stream.on("lanes", (answer) => this.#answered(answer));
     this.#stream.on("error", (error) => listener.onError(this, error));
@@ -82,13 +89,17 @@ export class LanePane {
     return this.#stream.ready;
   }
 
+  /** Whether a frame that is captured now would arrive when the service has answered the one before it. */
   get hasRoom() {
-    return this.state === "open" && this.#sent.size < MOST_UNANSWERED;
+    if (this.state !== "open" || this.#sent.size >= MOST_UNANSWERED) return false;
+    const [latest = -Infinity] = this.#sent.values();
+    return now() - latest >= this.#pauseMs;
   }
 
   /** @param {CapturedFrame} frame */
   send(frame) {
     this.#sent.set(frame.seq, now());
+    if (this.#pauseMs > 0) setTimeout(() => this.#listener.onRoom(this.hasRoom), this.#pauseMs);
     const settled = () => {
       this.#sent.delete(frame.seq);
       this.#listener.onRoom(this.hasRoom);
@@ -114,7 +125,7 @@ export class LanePane {
   /** Draws the frame that is shown again. */
   redraw() {
     if (this.frame === null) return;
-    drawFrame(this.#context, this.frame.picture, this.answer, this.unseen);
+    drawFrame(this.#context, this.frame.picture, this.answer, this.unseen, this.#shownWidth);
     if (this.horizon !== null) drawHorizon(this.#context, this.horizon);
   }
 
@@ -142,8 +153,11 @@ export class LanePane {
     }
     this.redraw();
     const drawn = now();
-    this.#publish();
-    this.#listener.onDrawn(this, stagesOf(frame, sent, answered, drawn, answer.timing_ms), drawn);
+    const stages = stagesOf(frame, sent, answered, drawn, answer.timing_ms);
+    const pauseMs = answered - sent - stages.queue - stages.encode;
+    this.#pauseMs += NEWEST * (pauseMs - this.#pauseMs);
+    this.#publish(answer, frame, stages);
+    this.#listener.onDrawn(this, stages, drawn);
     if (this.#lost === null) return;
     const kept = answer.lanes.map((lane) => lane.track_id).filter((id) => this.#lost?.ids.includes(id));
     const back = { resumed: this.resumed === true, seconds: (answered - this.#lost.at) / 1000, kept };
@@ -174,12 +188,17 @@ export class LanePane {
     for (const lane of answer.lanes) if (lane.state !== "predicted") this.#detected.set(lane.track_id, answer.timestamp);
   }
 
-  /** Says in attributes what is shown, for tests and for whoever looks. */
-  #publish() {
-    const { answer, frame } = /** @type {{answer: LanesMessage, frame: CapturedFrame}} */ (this);
+  /**
+   * Says in attributes what is shown, for tests and for whoever looks.
+   * @param {LanesMessage} answer
+   * @param {CapturedFrame} frame
+   * @param {Stages} stages
+   */
+  #publish(answer, frame, stages) {
     Object.assign(this.canvas.dataset, {
       seq: answer.seq,
       frame: frame.seq,
+      latency: stages.total.toFixed(1),
       timestamp: answer.timestamp,
       ids: answer.lanes.map((lane) => lane.track_id).join(" "),
       ego: `${answer.ego.left ?? ""} ${answer.ego.right ?? ""}`.trim(),
