@@ -14,7 +14,7 @@ from contextlib import contextmanager
 def service(port: int = 0, **settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Runs a service in a separate process and yields the process and its URL once it is ready.
 
-    It listens on `port`, or on a free one.
+    It listens on `port`, by default a free one.
     """
     environment = {f"LANESTREAM_{name.upper()}": str(value) for name, value in settings.items()}
     command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", str(port), "--provider", "cpu"]
