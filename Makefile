@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types page-types demo-clip page-speed page-picture lock asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -55,6 +55,26 @@ js: $(JS_READY)
 # Its types of messages, from the service's JSON Schemas.
 js-types: $(JS_READY) $(DEV_READY)
 	$(BIN)/python tools/js_types.py
+
+# Checks the types in the modules of the live page, against those of the client.
+page-types: $(JS_READY)
+	cd client/js && npm run --silent build
+	rm -rf out/page-types
+	mkdir -p out/page-types/client
+	cp service/lanestream/api/static/*.js out/page-types
+	cp client/js/dist/* out/page-types/client
+	client/js/node_modules/.bin/tsc -p client/js/tsconfig.page.json
+
+# The drive that the live page plays. It is in the repository.
+demo-clip: $(DEV_READY)
+	$(BIN)/python tools/demo_clip.py service/lanestream/api/static/demo.webm
+
+# These need chromium.
+page-speed: $(DEV_READY)
+	$(BIN)/python tools/live_page.py speed $(ARGS)
+
+page-picture: $(DEV_READY)
+	$(BIN)/python tools/live_page.py picture docs/live-page.jpg
 
 MODELS := service/lanestream/models
 
