@@ -108,8 +108,10 @@ class FrameEncoder {
       const sentSize = fitted(width, height, this.#plan.width);
       this.#view.draw(source, ...viewSize);
       source.close();
-      this.#sent.draw(this.#view.canvas, ...sentSize);
-      const blob = await this.#sent.canvas.convertToBlob({ type: "image/jpeg", quality: this.#plan.quality });
+      const isSameSize = sentSize[0] === viewSize[0];
+      if (!isSameSize) this.#sent.draw(this.#view.canvas, ...sentSize);
+      const { canvas } = isSameSize ? this.#view : this.#sent;
+      const blob = await canvas.convertToBlob({ type: "image/jpeg", quality: this.#plan.quality });
       const picture = this.#view.canvas.transferToImageBitmap();
       const frame = { seq: this.#seq, timestamp, captured, started, encoded: now(), picture, blob, width: sentSize[0], height: sentSize[1] };
       this.#seq += 1;

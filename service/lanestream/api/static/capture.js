@@ -193,7 +193,10 @@ export class Capture {
       this.#isAsked = true;
       return;
     }
-    const time = "timestamp" in source ? source.timestamp / 1e6 : isWatched ? this.#presented.time : video.currentTime;
+    const about = isWatched ? this.#presented.time : video.currentTime;
+    // Its own time is the exact one. Firefox 153 reports it in whole seconds, not in microseconds.
+    const hasTime = "timestamp" in source && Math.abs(source.timestamp - about) > 1;
+    const time = hasTime ? source.timestamp / 1e6 : about;
     if (time < this.#lastTime) this.#offset += Number.isFinite(video.duration) ? video.duration : this.#lastTime;
     this.#lastTime = time;
     this.#worker.postMessage({ type: "frame", source, captured, timestamp: time + this.#offset }, [source]);

@@ -9,9 +9,12 @@ const STRAIGHT = 1 / 3000;
 // The bar shows this many lane widths; 95 % of a normal distribution lie within this many sigmas.
 const BAR_LANES = 1.28;
 const SIGMAS = 1.96;
+// Numbers that change more often can't be read.
+const REFRESH_MS = 150;
 
 export class Readings {
   #root;
+  #refreshed = -Infinity;
 
   /** @param {ParentNode} root */
   constructor(root) {
@@ -20,10 +23,13 @@ export class Readings {
 
   /** @param {LanesMessage} answer */
   show({ ego, lanes, departure }) {
+    this.#showOffset(ego, departure?.state ?? "none");
+    if (performance.now() - this.#refreshed < REFRESH_MS) return;
+    this.#refreshed = performance.now();
     this.#text("reading-offset", offsetText(ego));
     this.#text("reading-width", ego.lane_width_m === null ? "–" : `${ego.lane_width_m.toFixed(2)} m`);
     this.#text("reading-radius", radiusText(ego.curvature));
-    this.#showOffset(ego, departure?.state ?? "none");
+    this.#find("offset").setAttribute("aria-label", `Position in the lane: ${offsetText(ego)}`);
     this.#showLanes(lanes);
   }
 
@@ -40,7 +46,6 @@ export class Readings {
   #showOffset(ego, state) {
     const bar = this.#find("offset");
     bar.dataset.state = state;
-    bar.setAttribute("aria-label", `Position in the lane: ${offsetText(ego)}`);
     const [spread, vehicle] = /** @type {HTMLElement[]} */ ([bar.querySelector(".spread"), bar.querySelector(".vehicle")]);
     spread.hidden = vehicle.hidden = ego.offset === null;
     if (ego.offset === null) return;
