@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +18,7 @@ import numpy as np
 import processes
 import pytest
 from av.video.stream import VideoStream
-from livepage import LivePage
+from livepage import WAIT_S, LivePage
 from numpy.typing import NDArray
 from playwright.sync_api import Page, expect
 from redisserver import redis_server
@@ -319,6 +322,34 @@ def test_settings_are_kept_in_the_address(live: LivePage, service: str) -> None:
     live.page.keyboard.press("d")
     live.wait_until_drawn()
     assert live.shown("detector") == "regression"
+
+
+def test_the_python_program_runs(live: LivePage, service: str, road_frames: list[bytes], tmp_path: Path) -> None:
+    write_video(tmp_path / "drive.webm", road_images(road_frames, 5)).rename(tmp_path / "drive.mp4")
+    live.open(service, "#detector=regression&kinds=marking&horizon=0.45&height=1.4&fov=60")
+    live.page.locator("#tab-python").click()
+    command = [sys.executable, "-c", live.text("#snippet")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=WAIT_S)
+    assert done.stderr == ""
+    assert len(re.findall(r"lane_width_m=\d", done.stdout)) == 5
+    assert all(line.startswith(f"{seq} ") for seq, line in enumerate(done.stdout.splitlines()))
+
+
+def test_the_javascript_program_runs(live: LivePage, service: str, road_frames: list[bytes]) -> None:
+    live.open(service, "#detector=regression&kinds=marking&horizon=0.45&height=1.4&fov=60")
+    live.page.locator("#tab-javascript").click()
+    # Static imports work only in modules.
+    program = re.sub("import (.*) from (.*);", r"const \1 = await import(\2);", live.text("#snippet"))
+    ego = live.page.evaluate(
+        f"""(bytes) => new Promise((resolve, reject) => {{
+            const jpeg = new Blob([new Uint8Array(bytes)], {{ type: "image/jpeg" }});
+            const console = {{ log: (seq, ego) => resolve(ego) }};
+            (async () => {{ {program}
+            }})().catch(reject);
+        }})""",
+        list(road_frames[0]),
+    )
+    assert ego["lane_width_m"] > 2.0
 
 
 def test_a_changed_setting_keeps_the_session(playing: LivePage) -> None:

@@ -22,6 +22,8 @@ import { Problem, captureProblem, insecureProblem, videoProblem } from "./proble
 
 // A video that presents no frame for this long is looked at by the worker's timer, for example in a hidden page.
 const SILENCE_MS = 150;
+// A video whose time falls by more than this has started again.
+const LEAST_JUMP_S = 0.5;
 
 /** A running source. */
 export class Capture {
@@ -197,7 +199,13 @@ export class Capture {
     // Its own time is the exact one. Firefox 153 reports it in whole seconds, not in microseconds.
     const hasTime = "timestamp" in source && Math.abs(source.timestamp - about) > 1;
     const time = hasTime ? source.timestamp / 1e6 : about;
-    if (time < this.#lastTime) this.#offset += Number.isFinite(video.duration) ? video.duration : this.#lastTime;
+    const hasStartedAgain = time < this.#lastTime - LEAST_JUMP_S;
+    if (time <= this.#lastTime && !hasStartedAgain) {
+      source.close();
+      this.#isAsked = true;
+      return;
+    }
+    if (hasStartedAgain) this.#offset += Number.isFinite(video.duration) ? video.duration : this.#lastTime;
     this.#lastTime = time;
     this.#worker.postMessage({ type: "frame", source, captured, timestamp: time + this.#offset }, [source]);
   }
