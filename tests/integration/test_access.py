@@ -437,6 +437,15 @@ def test_keys_are_never_logged() -> None:
     assert "camera-7" in messages
     for secret in (TOKEN, KEY.digest, wrong):
         assert secret not in "".join(lines)
+    by_event = {record["event"]: record for record in records if "event" in record}
+    assert by_event.keys() == {"listening", "detector_loaded", "ready", "request", "stream_opened", "stream_closed"}
+    assert by_event["stream_opened"]["caller"] == "camera-7"
+    assert by_event["stream_closed"]["session"] == by_event["stream_opened"]["session"]
+    assert {name: by_event["stream_closed"][name] for name in ("frames", "answered", "dropped")} == {
+        "frames": 1,
+        "answered": 1,
+        "dropped": 0,
+    }
 
 
 def test_a_service_without_keys_logs_a_warning() -> None:

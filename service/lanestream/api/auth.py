@@ -8,7 +8,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Self
 from urllib.parse import urlsplit
 
@@ -45,9 +45,15 @@ class Authenticator:
     @classmethod
     def from_settings(cls, settings: Settings) -> Self:
         """Returns the authenticator for these settings. Raises SettingsError if the file of API keys can't be used."""
-        from_file = read_keys(settings.api_keys_file) if settings.api_keys_file is not None else ()
-        signer = TokenSigner.from_settings(settings)
-        return cls((*settings.api_keys, *from_file), frozenset(settings.allowed_origins), signer)
+        return cls(_read_keys(settings), frozenset(settings.allowed_origins), TokenSigner.from_settings(settings))
+
+    def with_keys_of(self, settings: Settings) -> Self:
+        """Returns this authenticator with the keys that the file has now. Raises SettingsError if it can't be used."""
+        return replace(self, keys=_read_keys(settings))
+
+    def knows(self, caller: Caller) -> bool:
+        """Returns whether `caller`, who was authenticated before, would still be: keys can be removed."""
+        return not self.keys or any(key.name == caller.identity for key in self.keys)
 
     def authenticate(self, connection: HTTPConnection) -> Caller:
         """Returns the caller behind a request, or behind a WebSocket that is not accepted yet.
@@ -113,6 +119,11 @@ def warn_if_open(authenticator: Authenticator, host: str, *, loopback: bool) -> 
             " and set LANESTREAM_API_KEYS, or listen on 127.0.0.1",
             host,
         )
+
+
+def _read_keys(settings: Settings) -> tuple[ApiKey, ...]:
+    from_file = () if settings.api_keys_file is None else read_keys(settings.api_keys_file)
+    return (*settings.api_keys, *from_file)
 
 
 def _credential(connection: HTTPConnection) -> str:

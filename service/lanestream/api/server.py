@@ -33,6 +33,8 @@ from lanestream.workers.process_pool import ProcessPool
 from lanestream.workers.thread_pool import ThreadPool
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from fastapi import FastAPI
 
     from lanestream.api.service import DrawLanes, Service
@@ -44,6 +46,7 @@ _log = logging.getLogger(__name__)
 _BACKLOG: Final = 2048
 _LARGEST_KEPT_BYTES: Final = 1 << 20
 _RETURN_MEMORY_S: Final = 10.0
+_KEYS_POLL_S: Final = 1.0
 # Files that the process needs besides its connections: models, pipes to workers, Redis, logs.
 _OTHER_FILES: Final = 128
 # After a drain, how long uvicorn waits for peers to close their connections.
@@ -113,6 +116,7 @@ class LanestreamServer(uvicorn.Server):
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         super().__init__(server_config(app, settings))
         self._service: Service = app.state.service
+        self.keys_requested = False
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -123,11 +127,16 @@ class LanestreamServer(uvicorn.Server):
     def stopping_on_signals(self) -> Iterator[None]:
         """Stops the server on SIGINT, SIGTERM or SIGHUP; ends the process at once on a second SIGINT or SIGTERM.
 
+        With a file of API keys, SIGHUP reads it again instead, as is usual for services.
+
         After the block the process ends by the first of them, so that its parent sees why it ended.
         """
         received: list[int] = []
 
         def stop(number: int, _: FrameType | None) -> None:
+            if number == signal.SIGHUP and self._service.settings.api_keys_file is not None:
+                self.keys_requested = True
+                return
             if received and number != signal.SIGHUP:
                 flush_logs()
                 os._exit(_SIGNALED + number)
@@ -158,7 +167,7 @@ class LanestreamServer(uvicorn.Server):
 
 
 async def _serve(
-    server: uvicorn.Server,
+    server: LanestreamServer,
     listener: socket.socket,
     app: FastAPI,
     load: Callable[[], Engine],
@@ -169,7 +178,8 @@ async def _serve(
     warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
     for conflict in package_conflicts():
         _log.warning("%s", conflict)
-    _log.info("listening on %s, loading the networks", _http_url(host, port))
+    url = _http_url(host, port)
+    _log.info("listening on %s, loading the networks", url, extra={"event": "listening", "url": url})
     starting = asyncio.create_task(_start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
     if not starting.done():  # a signal came first
@@ -181,8 +191,17 @@ async def _serve(
         app.state.service.install(pool)
         for info in pool.capabilities.detectors:
             network = info.model
-            _log.info("detector %s: %s on %s (%s)", info.detector, network.name, network.provider, network.reason)
-        _log.info("ready")
+            _log.info(
+                "detector %s: %s on %s (%s)",
+                *(info.detector, network.name, network.provider, network.reason),
+                extra={
+                    "event": "detector_loaded",
+                    "detector": info.detector,
+                    "model": network.name,
+                    "provider": network.provider,
+                },
+            )
+        _log.info("ready", extra={"event": "ready"})
         if on_ready is not None:
             address = ipaddress.ip_address(host)
             loopback = "127.0.0.1" if address.version == 4 else "::1"
@@ -193,9 +212,36 @@ async def _serve(
         server.should_exit = True
         await serving
         raise
-    cleaning = asyncio.create_task(_return_memory())
+    upkeep = [asyncio.create_task(_return_memory())]
+    if app.state.service.settings.api_keys_file is not None:
+        upkeep.append(asyncio.create_task(_watch_keys(server, app.state.service)))
     await serving
-    cleaning.cancel()
+    for task in upkeep:
+        task.cancel()
+
+
+async def _watch_keys(server: LanestreamServer, service: Service) -> None:
+    """Reads the file of API keys again when it has changed, and when SIGHUP asks for it."""
+    path = service.settings.api_keys_file
+    assert path is not None  # noqa: S101 - checked by the caller
+    loaded, previous = None, None
+    while True:
+        await asyncio.sleep(_KEYS_POLL_S)
+        found = await asyncio.to_thread(_version_of, path)
+        # A file that is still being written may lack keys, so it must not have changed since the last look.
+        if server.keys_requested or (found != loaded and found == previous):
+            server.keys_requested, loaded = False, found
+            service.reload_keys()
+        previous = found
+
+
+def _version_of(path: Path) -> tuple[int, ...] | None:
+    """Returns what changes with the content of a file, also if another one takes its place; None if it is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _http_url(host: str, port: int) -> str:

@@ -1,14 +1,16 @@
-"""The files of the live page over real sockets: who gets them, and with which headers."""
+"""The files of the pages for browsers over real sockets: who gets them, and with which headers."""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import stat
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import urljoin
 
 import fakes
 import httpx
@@ -19,9 +21,15 @@ from lanestream.keys import new_key
 Serve = Callable[..., str]
 
 
+@pytest.fixture
+def guarded(serve: Serve) -> str:
+    """Returns the URL of a service that requires a key."""
+    return serve(fakes.engine(), api_keys=str(new_key("camera-7")[1]))
+
+
 @pytest.mark.parametrize("path", ["/", "/static/index.html"])
-def test_the_page_needs_no_key_and_may_only_use_its_own_scripts(serve: Serve, path: str) -> None:
-    response = httpx.get(serve(fakes.engine(), api_keys=str(new_key("camera-7")[1])) + path)
+def test_the_page_needs_no_key_and_may_only_use_its_own_scripts(guarded: str, path: str) -> None:
+    response = httpx.get(guarded + path)
     assert response.status_code == 200
     assert response.headers["content-type"].startswith("text/html")
     policy = response.headers["content-security-policy"]
@@ -30,6 +38,18 @@ def test_the_page_needs_no_key_and_may_only_use_its_own_scripts(serve: Serve, pa
     assert response.headers["x-content-type-options"] == "nosniff"
     assert response.headers["referrer-policy"] == "no-referrer"
     assert response.headers["cache-control"] == "no-cache"
+
+
+def test_the_documentation_of_the_api_needs_nothing_from_elsewhere(guarded: str) -> None:
+    page = httpx.get(f"{guarded}/docs")
+    assert page.status_code == 200
+    assert "default-src 'self'" in page.headers["content-security-policy"]
+    links = re.findall(r'(?:href|src)="([^"]*)"', page.text)
+    assert len(links) >= 3
+    for link in links:
+        assert httpx.get(urljoin(str(page.url), link)).status_code == 200
+    assert not re.findall(r"https?://", page.text)
+    assert httpx.get(urljoin(str(page.url), re.findall(r"url: '([^']*)'", page.text)[0])).json()["openapi"]
 
 
 @pytest.mark.parametrize("path", ["/static/", "/static/../app.py", "/static/%2e%2e/app.py", "/static//etc/passwd"])

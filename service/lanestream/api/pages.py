@@ -1,4 +1,4 @@
-"""Serves the live page: files of the folder `static`, which need no key and hold no secret."""
+"""The pages for browsers: the live page, and the documentation of the REST API. Both work without internet access."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from fastapi.openapi.docs import get_swagger_ui_html
 from starlette.responses import FileResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 _FOLDER: Final = Path(__file__).parent / "static"
 
+# A page runs only its own scripts and connects only to this service, whatever a video or a message contains.
 _POLICY: Final = (
     "default-src 'self'",
     "img-src 'self' blob: data:",
@@ -27,7 +29,6 @@ _POLICY: Final = (
     "frame-ancestors 'none'",
 )
 _HEADERS: Final[Mapping[str, str]] = {
-    # The page runs only its own scripts and connects only to this service, whatever a video or a message contains.
     "content-security-policy": "; ".join(_POLICY),
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
@@ -35,10 +36,12 @@ _HEADERS: Final[Mapping[str, str]] = {
     # Browsers ask again each time, and a page never mixes the files of two versions.
     "cache-control": "no-cache",
 }
+# Swagger UI is started by a script in its page, and sets styles in its scripts.
+_DOCS_POLICY: Final = (*_POLICY, "script-src 'self' 'unsafe-inline'", "style-src 'self' 'unsafe-inline'")
 
 
 class _Files(StaticFiles):
-    """The files of a folder with the headers of the page."""
+    """Files with the headers of the pages."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         response = await super().get_response(path, scope)
@@ -46,10 +49,28 @@ class _Files(StaticFiles):
         return response
 
 
-def routes() -> list[BaseRoute]:
-    """Returns the routes of the page at `/` and of its files below `/static/`."""
+def live_page() -> list[BaseRoute]:
+    """Returns the routes of the live page at `/` and of its files below `/static/`."""
     return [Route("/", _index), Mount("/static", _Files(directory=_FOLDER))]
+
+
+def docs_page() -> list[BaseRoute]:
+    """Returns the routes of the API's documentation at `/docs`: Swagger UI, whose files are part of a package."""
+    return [Route("/docs", _docs), Mount("/swagger", _Files(packages=[("fastapi_swagger", "resources")]))]
 
 
 async def _index(_: Request) -> FileResponse:
     return FileResponse(_FOLDER / "index.html", headers=dict(_HEADERS))
+
+
+async def _docs(_: Request) -> Response:
+    # Relative, since a proxy may serve the service below a path.
+    page = get_swagger_ui_html(
+        openapi_url="openapi.json",
+        title="Lanestream",
+        swagger_js_url="swagger/swagger-ui-bundle.js",
+        swagger_css_url="swagger/swagger-ui.css",
+        swagger_favicon_url="swagger/favicon-32x32.png",
+    )
+    page.headers.update({**_HEADERS, "content-security-policy": "; ".join(_DOCS_POLICY)})
+    return page
