@@ -21,6 +21,9 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 # Marks what the environment was set up for. It is set up again when pyproject.toml changes.
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
+# The same for the packages of the JavaScript client; and its first compiled module.
+JS_READY := client/js/node_modules/.ready
+JS_BUILT := client/js/dist/index.js
 
 .PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types page-types demo-clip page-speed page-picture lock asyncapi asyncapi-check fuzz picture image image-test up down clean
 
@@ -33,7 +36,7 @@ serve: $(RUN_READY)
 train-toy: $(DEV_READY)
 	$(BIN)/python tools/train_toy.py
 
-test: $(DEV_READY) $(JS_READY)
+test: $(DEV_READY) $(JS_BUILT)
 	$(BIN)/python -m pytest
 
 lint: $(DEV_READY)
@@ -42,12 +45,10 @@ lint: $(DEV_READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The client for browsers and Node. Its modules for the live page are in the repository.
+# Builds the client for browsers and Node. Its modules for the live page are in the repository.
 PAGE_CLIENT := service/lanestream/api/static/client
-JS_READY := client/js/node_modules/.ready
 
-js: $(JS_READY)
-	cd client/js && npm run --silent build
+js: $(JS_BUILT)
 	rm -rf $(PAGE_CLIENT)
 	mkdir -p $(PAGE_CLIENT)
 	cp client/js/dist/*.js $(PAGE_CLIENT)
@@ -173,7 +174,7 @@ down:
 	$(COMPOSE) down
 
 clean:
-	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) client/js/node_modules client/js/dist out .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(VENV)/bin/python:
 	@"$(PYTHON)" $(NEW_ENOUGH) 2>/dev/null || \
@@ -192,4 +193,8 @@ $(JS_READY): client/js/package-lock.json
 	@command -v npm >/dev/null || { echo "error: no npm (on Debian: apt install nodejs npm)" >&2; exit 1; }
 	cd client/js && npm ci --silent --ignore-scripts || \
 	  { echo "error: the packages of client/js could not be installed: npm ci needs the npm registry" >&2; exit 1; }
+	@touch $@
+
+$(JS_BUILT): $(JS_READY) client/js/tsconfig.json $(wildcard client/js/src/*.ts)
+	cd client/js && rm -rf dist && npm run --silent build
 	@touch $@

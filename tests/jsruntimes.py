@@ -141,7 +141,10 @@ class PageScenario:
 
 
 class Chromium:
-    """Runs scenarios in a page of a service, so that the service sees its own origin."""
+    """Runs scenarios in a page of a service, so that the service sees its own origin.
+
+    The page itself comes from the service: one that a test made up may not connect to this machine.
+    """
 
     def __init__(self, page: Page, frames: str) -> None:
         self._page = page

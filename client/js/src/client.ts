@@ -1,6 +1,6 @@
 import type { Platform } from "./connection.js";
 import { checkKey, type Endpoint, keyHeaders, parseEndpoints, refusalError, unreachableError } from "./endpoint.js";
-import { isRetryable, LaneError, timeoutError } from "./errors.js";
+import { isRetryable, LaneError, timeoutError, timeoutSignal } from "./errors.js";
 import type { LanesMessage, ModelList } from "./messages.js";
 import type { ImageFile, StreamOptions } from "./protocol.js";
 import { LaneStream } from "./stream.js";
@@ -93,7 +93,7 @@ export class LaneClient {
 
   async #requestFrom(endpoint: Endpoint, path: string, init: RequestInit): Promise<unknown> {
     const headers = keyHeaders(await this.#key());
-    const signal = AbortSignal.timeout(1000 * this.#timeoutS);
+    const signal = timeoutSignal(this.#timeoutS);
     let status: number;
     let body: string;
     try {

@@ -1,5 +1,5 @@
 import { type Endpoint, keyHeaders, pageOrigin, refusalError, unreachableError } from "./endpoint.js";
-import { LaneError, timeoutError } from "./errors.js";
+import { LaneError, timeoutError, timeoutSignal } from "./errors.js";
 
 const SUBPROTOCOL = "lanestream.v1";
 const KEY_SUBPROTOCOL = "bearer.";
@@ -187,7 +187,7 @@ async function refusalReason(
   // Browsers name the origin of the page only in requests to other origins.
   const origin = pageOrigin();
   const query = origin === null ? "" : `?origin=${encodeURIComponent(origin)}`;
-  const deadline = AbortSignal.any([signal, AbortSignal.timeout(1000 * timeoutS)]);
+  const deadline = AbortSignal.any([signal, timeoutSignal(timeoutS)]);
   const request: RequestInit = { headers: keyHeaders(key), signal: deadline, cache: "no-store" };
   try {
     const response = await platform.fetch(`${endpoint.http}/v1/stream${query}`, request);

@@ -69,5 +69,12 @@ export function isRetryable(error: LaneError): boolean {
 
 /** Returns the error for a request that took longer than `seconds`. */
 export function timeoutError(what: string, seconds: number): LaneError {
-  return new LaneError("connection_failed", `${what} took longer than ${seconds} s`, "check the network and the service");
+  const problem = `${what} took longer than ${Math.round(10 * seconds) / 10} s`;
+  return new LaneError("connection_failed", problem, "check the network and the service");
+}
+
+/** Returns a signal that is aborted after `seconds`. */
+export function timeoutSignal(seconds: number): AbortSignal {
+  // Node accepts only whole milliseconds.
+  return AbortSignal.timeout(Math.ceil(1000 * seconds));
 }

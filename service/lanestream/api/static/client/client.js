@@ -1,5 +1,5 @@
 import { checkKey, keyHeaders, parseEndpoints, refusalError, unreachableError } from "./endpoint.js";
-import { isRetryable, LaneError, timeoutError } from "./errors.js";
+import { isRetryable, LaneError, timeoutError, timeoutSignal } from "./errors.js";
 import { LaneStream } from "./stream.js";
 /** A client of a Lanestream service, or of several replicas of one. */
 export class LaneClient {
@@ -67,7 +67,7 @@ export class LaneClient {
     }
     async #requestFrom(endpoint, path, init) {
         const headers = keyHeaders(await this.#key());
-        const signal = AbortSignal.timeout(1000 * this.#timeoutS);
+        const signal = timeoutSignal(this.#timeoutS);
         let status;
         let body;
         try {

@@ -53,5 +53,11 @@ export function isRetryable(error) {
 }
 /** Returns the error for a request that took longer than `seconds`. */
 export function timeoutError(what, seconds) {
-    return new LaneError("connection_failed", `${what} took longer than ${seconds} s`, "check the network and the service");
+    const problem = `${what} took longer than ${Math.round(10 * seconds) / 10} s`;
+    return new LaneError("connection_failed", problem, "check the network and the service");
+}
+/** Returns a signal that is aborted after `seconds`. */
+export function timeoutSignal(seconds) {
+    // Node accepts only whole milliseconds.
+    return AbortSignal.timeout(Math.ceil(1000 * seconds));
 }
