@@ -166,6 +166,35 @@ def test_a_camera_streams(live: LivePage, service: str) -> None:
     live.wait_for_ego_lane()
 
 
+def test_a_screen_streams_until_it_is_not_shared_any_more(live: LivePage, service: str) -> None:
+    # A headless Chromium has no screen: its camera stands in for one.
+    live.page.add_init_script(
+        """navigator.mediaDevices.getDisplayMedia = async () => {
+            window.shared = await navigator.mediaDevices.getUserMedia({ video: true });
+            return window.shared;
+        }"""
+    )
+    live.open(service, REGRESSION)
+    live.page.locator(".toolbar [data-source=screen]").click()
+    live.wait_until_drawn()
+    assert live.attribute("source") == "screen"
+    live.page.evaluate("window.shared.getTracks()[0].dispatchEvent(new Event('ended'))")
+    live.wait("the end", lambda: live.attribute("state") == "idle")
+    expect(live.page.locator("#welcome")).to_be_visible()
+
+
+def test_a_camera_goes_on_in_a_hidden_page(live: LivePage, service: str) -> None:
+    # Animation frames and timers of the page stand still, as in a tab in the background.
+    live.page.add_init_script(
+        "requestAnimationFrame = () => 0; HTMLVideoElement.prototype.requestVideoFrameCallback = () => 0;"
+    )
+    live.open(service, REGRESSION)
+    live.page.keyboard.press("c")
+    live.wait_until_drawn(5)
+    live.page.keyboard.press("d")
+    live.wait_until_drawn(5)
+
+
 def test_a_file_that_is_not_a_video_is_explained(
     live: LivePage, service: str, console_errors: list[str], tmp_path: Path
 ) -> None:

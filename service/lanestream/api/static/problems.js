@@ -30,6 +30,22 @@ const BY_CODE = {
   connection_failed: ["The service can't be reached", "Check that it runs; the page tries again by itself"],
 };
 
+/** @type {Record<string, [string, string]>} by the name of the exception */
+const CAMERA = {
+  NotAllowedError: ["The browser may not use the camera", "Allow it in the browser's settings of this site, then try again"],
+  NotFoundError: ["No camera was found", "Connect one, or play a video file"],
+  OverconstrainedError: ["No suitable camera was found", "Connect another one, or play a video file"],
+  NotReadableError: ["The camera can't be read", "Close other programs that use it, then try again"],
+  AbortError: ["The camera can't be read", "Connect it again, then try again"],
+};
+/** @type {Record<string, [string, string]>} */
+const SCREEN = {
+  NotAllowedError: ["No screen was shared", "Choose a screen, a window or a tab, and allow the browser to share it"],
+  NotFoundError: ["This device has no screen to share", "Play a video file instead"],
+  NotReadableError: ["This screen can't be read", "Choose another window or tab"],
+  AbortError: ["This screen can't be read", "Choose another window or tab"],
+};
+
 /**
  * Returns the line that explains an error of the client library to a visitor.
  * @param {{code: string, message: string, hint?: string}} error
@@ -47,17 +63,10 @@ export function explain(error) {
  */
 export function captureProblem(error, kind) {
   const name = error instanceof DOMException ? error.name : "";
-  const what = kind === "camera" ? "camera" : "screen";
-  if (name === "NotAllowedError") {
-    return new Problem(`The browser may not use the ${what}`, `Allow it in the browser's settings of this site, then try again`);
-  }
-  if (name === "NotFoundError" || name === "OverconstrainedError") {
-    return new Problem(`No ${what} was found`, kind === "camera" ? "Connect a camera, or play a video file" : "Play a video file instead");
-  }
-  if (name === "NotReadableError" || name === "AbortError") {
-    return new Problem(`The ${what} can't be read`, "Close other programs that use it, then try again");
-  }
-  return new Problem(`The ${what} can't be used: ${error instanceof Error ? error.message : String(error)}`, "Play a video file instead");
+  const problems = { camera: CAMERA, screen: SCREEN }[kind];
+  if (name in problems) return new Problem(...problems[name]);
+  const reason = error instanceof Error ? error.message : String(error);
+  return new Problem(`The ${kind} can't be used: ${reason}`, "Play a video file instead");
 }
 
 /** Returns the problem of a page that may not use cameras because its connection is not secure. */
