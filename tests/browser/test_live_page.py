@@ -144,6 +144,17 @@ def test_a_4k_video_is_scaled_down(live: LivePage, service: str, road_frames: li
     assert abs(width / height - 16.0 / 9.0) < 0.01
 
 
+def test_frames_get_smaller_than_the_limit(live: LivePage) -> None:
+    with processes.service(max_pixels=300_000) as (_, url):
+        live.open(url, REGRESSION)
+        live.page.keyboard.press("d")
+        live.wait_until_drawn()
+        width, height = map(int, live.shown("sent").split("x"))
+        assert width * height <= 300_000
+        assert "pixels" not in live.text("#log")
+        live.leave()
+
+
 def test_a_dropped_video_plays(live: LivePage, service: str) -> None:
     live.open(service, REGRESSION)
     live.page.evaluate(

@@ -4,16 +4,17 @@ import { Access } from "./access.js";
 import { drawMap } from "./birds-eye.js";
 import { Capture } from "./capture.js";
 import { LaneClient } from "./client/index.js";
+import { CodeView, copyText } from "./code-view.js";
+import { showConnection } from "./connection.js";
 import { LatencyView } from "./latency.js";
 import { Notices, eventNotice } from "./notices.js";
 import { Problem, explain } from "./problems.js";
 import { Readings } from "./readings.js";
-import { Recording, download, downloadLink, nameNow } from "./recording.js";
+import { Recordings, download, downloadLink, nameNow } from "./recording.js";
 import { LiveSession } from "./session.js";
 import { SettingsForm } from "./settings-form.js";
 import { DEMO_CAMERA, hashFromSettings, settingsFromHash, streamOptions } from "./settings.js";
 import { listenForShortcuts } from "./shortcuts.js";
-import { snippet } from "./snippets.js";
 import { restoreTheme, toggleTheme } from "./theme.js";
 
 /**
@@ -27,7 +28,6 @@ const BASE = new URL(".", location.href);
 const RECONNECT_S = 3600;
 const SAME_ERROR_MS = 5000;
 const BOTH = /** @type {("candidates" | "regression")[]} */ (["candidates", "regression"]);
-const LANGUAGES = /** @type {const} */ (["curl", "python", "javascript"]);
 
 /**
  * @template {HTMLElement} Kind
@@ -52,11 +52,10 @@ class LivePage {
   #capture = null;
   /** @type {LiveSession | null} */
   #session = null;
-  /** @type {Map<LanePane, Recording>} */
-  #recordings = new Map();
+  #recordings = new Recordings();
+  #code = new CodeView();
   #isPaused = false;
   #drawn = 0;
-  #language = /** @type {import("./settings.js").Language} */ ("curl");
   /** @type {Map<string, number>} when each kind of error was shown last */
   #shownErrors = new Map();
 
@@ -138,34 +137,24 @@ class LivePage {
   }
 
   async toggleRecording() {
-    if (this.#recordings.size > 0) {
+    if (this.#recordings.areRunning) {
       await this.#stopRecording();
-      return;
-    }
-    const panes = this.#session?.panes.filter((pane) => pane.frame !== null) ?? [];
-    if (panes.length === 0) return;
-    if (!Recording.isSupported) {
+    } else if (!Recordings.areSupported) {
       this.#notices.problem(new Problem("This browser can't record", "Use a current Chrome, Edge, Firefox or Safari").line);
-      return;
+    } else {
+      this.#recordings.start(this.#session?.panes.filter((pane) => pane.frame !== null) ?? []);
+      this.#show();
     }
-    const name = nameNow();
-    for (const pane of panes) {
-      const suffix = panes.length > 1 ? `-${pane.ready?.detector}` : "";
-      this.#recordings.set(pane, new Recording(pane.canvas, name + suffix));
-    }
-    this.#show();
   }
 
   async #stopRecording() {
-    if (this.#recordings.size === 0) return;
-    const recordings = [...this.#recordings.values()];
-    this.#recordings.clear();
-    this.#show();
-    const files = (await Promise.all(recordings.map((recording) => recording.stop()))).flat();
+    if (!this.#recordings.areRunning) return;
+    const files = await this.#recordings.stop();
     const area = element("downloads");
     for (const link of area.querySelectorAll("a")) URL.revokeObjectURL(link.href);
     area.replaceChildren("Recorded: ", ...files.map(downloadLink));
     area.hidden = false;
+    this.#show();
   }
 
   #connect() {
@@ -257,7 +246,7 @@ class LivePage {
   #showAnswer(pane, stages, drawn) {
     const answer = /** @type {import("./client/index.js").LanesMessage} */ (pane.answer);
     const frame = /** @type {import("./capture.js").CapturedFrame} */ (pane.frame);
-    this.#recordings.get(pane)?.add(answer);
+    this.#recordings.add(pane);
     if (this.#session?.panes.length === 2) {
       const caption = pane.canvas.nextElementSibling;
       if (caption) caption.textContent = `${pane.ready?.detector} · ${answer.timing_ms.total.toFixed(0)} ms in the service`;
@@ -301,19 +290,21 @@ class LivePage {
     });
     element("welcome").hidden = isRunning;
     element("panes").hidden = !isRunning;
-    this.#showConnection(worst);
+    showConnection(element("connection"), worst);
     for (const button of document.querySelectorAll(".toolbar [data-source]")) {
       button.setAttribute("aria-pressed", String(/** @type {HTMLElement} */ (button).dataset.source === this.#capture?.kind));
     }
     for (const id of ["pause", "stop", "break"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !isRunning;
     for (const id of ["snapshot", "record"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !hasPicture;
     element("pause").textContent = this.#isPaused ? "Resume" : "Pause";
-    element("record").textContent = this.#recordings.size > 0 ? "Stop recording" : "Record";
-    element("record").setAttribute("aria-pressed", String(this.#recordings.size > 0));
+    element("record").textContent = this.#recordings.areRunning ? "Stop recording" : "Record";
+    element("record").setAttribute("aria-pressed", String(this.#recordings.areRunning));
     if (!isRunning) element("stage").dataset.departure = "";
     this.#form.camera = this.#camera;
     element("map-hint").hidden = Boolean(this.#camera);
-    this.#showSnippet();
+    const { settings } = this.#form;
+    const [{ detector = null }] = this.#options;
+    this.#code.show({ url: BASE.href, needsKey: this.#access.needsKey, detector, settings, camera: this.#camera });
   }
 
   /** The pane with the worst connection, which stands for all. */
@@ -321,38 +312,6 @@ class LivePage {
     const order = ["failed", "ended", "reconnecting", "connecting", "open"];
     const panes = this.#session?.panes ?? [];
     return panes.toSorted((a, b) => order.indexOf(a.state) - order.indexOf(b.state))[0] ?? null;
-  }
-
-  /** @param {LanePane | null} pane */
-  #showConnection(pane) {
-    const state = pane?.state ?? "idle";
-    const connection = element("connection");
-    const why = pane?.reason ? `: ${pane.reason}` : "";
-    const attempt = pane && pane.attempt > 1 ? `, attempt ${pane.attempt}` : "";
-    const texts = /** @type {Record<string, string>} */ ({
-      open: pane?.resumed == null ? "Connected" : pane.resumed ? "Connected, same session" : "Connected, new session",
-      connecting: `Connecting${attempt}${why}`,
-      reconnecting: `Reconnecting${attempt}${why}`,
-    });
-    const text = texts[state] ?? "Not connected";
-    connection.dataset.state = state === "open" && pane?.resumed === false ? "new" : state;
-    connection.title = text;
-    const label = /** @type {HTMLElement} */ (connection.querySelector("span"));
-    if (label.textContent !== text) label.textContent = text;
-  }
-
-  #showSnippet() {
-    const { settings } = this.#form;
-    const [{ detector }] = this.#options;
-    const text = snippet(this.#language, {
-      url: BASE.href,
-      needsKey: this.#access.needsKey,
-      detector: detector ?? null,
-      settings,
-      camera: this.#camera,
-    });
-    const code = /** @type {HTMLElement} */ (element("snippet").querySelector("code"));
-    if (code.textContent !== text) code.textContent = text;
   }
 
   /** Asks which detectors the service has, which everyone may know. */
@@ -394,7 +353,7 @@ class LivePage {
       theme: toggleTheme,
       "help-open": () => /** @type {HTMLDialogElement} */ (element("help")).showModal(),
       reset: () => this.#form.reset(),
-      copy: () => void copyText(element("snippet").textContent ?? "", element("copy")),
+      copy: () => void copyText(this.#code.text, element("copy")),
       "copy-link": () => void copyText(location.href, element("copy-link")),
     };
     for (const [id, action] of Object.entries(actions)) element(id).addEventListener("click", action);
@@ -410,36 +369,11 @@ class LivePage {
       escape: actions.stop,
       "?": actions["help-open"],
     });
-    this.#wireTabs();
     this.#wireDrop();
     addEventListener("hashchange", () => this.#form.replace(settingsFromHash(location.hash)));
     addEventListener("resize", () => {
       const pane = this.#session?.panes[0];
       drawMap(element("map"), pane?.answer?.lanes ?? [], pane?.unseen ?? (() => 0));
-    });
-  }
-
-  #wireTabs() {
-    const tabs = LANGUAGES.map((language) => element(`tab-${language}`));
-    /** @param {number} index */
-    const select = (index) => {
-      this.#language = LANGUAGES[index];
-      tabs.forEach((tab, other) => {
-        tab.setAttribute("aria-selected", String(other === index));
-        tab.tabIndex = other === index ? 0 : -1;
-      });
-      element("snippet").setAttribute("aria-labelledby", tabs[index].id);
-      this.#showSnippet();
-    };
-    tabs.forEach((tab, index) => {
-      tab.addEventListener("click", () => select(index));
-      tab.addEventListener("keydown", ({ key }) => {
-        const step = { ArrowRight: 1, ArrowLeft: tabs.length - 1 }[key];
-        if (step === undefined) return;
-        const next = (index + step) % tabs.length;
-        select(next);
-        tabs[next].focus();
-      });
     });
   }
 
@@ -460,22 +394,6 @@ class LivePage {
       if (video) void this.start("file", video);
     });
   }
-}
-
-/**
- * Copies text, and says so on the button for a moment.
- * @param {string} text
- * @param {HTMLElement} button
- */
-async function copyText(text, button) {
-  const label = (button.dataset.label ??= button.textContent ?? "");
-  try {
-    await navigator.clipboard.writeText(text);
-    button.textContent = "Copied";
-  } catch {
-    button.textContent = "Select it and copy";
-  }
-  setTimeout(() => (button.textContent = label), 1500);
 }
 
 /** @param {number[]} ids */

@@ -37,6 +37,19 @@ export class Pacing {
   }
 
   /**
+   * Returns whether the service accepts a frame of this size. If not, the next ones are smaller.
+   * @param {{blob: Blob, width: number, height: number}} frame
+   * @param {number} now in milliseconds
+   */
+  accepts(frame, now) {
+    if (this.limits === null || this.#step === 0) return true;
+    if (frame.blob.size <= this.limits.max_bytes && frame.width * frame.height <= this.limits.max_pixels) return true;
+    this.#needed = Infinity;
+    this.#goTo(this.#step - 1, now);
+    return false;
+  }
+
+  /**
    * Considers an answered frame. Returns whether the plan has changed.
    * @param {{encode: number, network: number, decode: number}} stages in milliseconds
    * @param {{blob: Blob, width: number, height: number}} frame
@@ -45,7 +58,6 @@ export class Pacing {
   answered(stages, frame, now) {
     this.#costs.push(stages.encode + stages.network + stages.decode);
     this.#bytes = frame.blob.size;
-    if (this.#exceedsLimits(frame)) return this.#goTo(this.#step - 1, now);
     if (now - this.#reviewed < REVIEW_MS || this.#costs.length < 5) return false;
     const cost = this.#costs.sort((a, b) => a - b)[this.#costs.length >> 1];
     if (cost > TOO_SLOW_MS) {
@@ -66,12 +78,6 @@ export class Pacing {
   get #intervalMs() {
     if (this.limits === null) return FASTEST_MS;
     return Math.max(FASTEST_MS, 1000 / this.limits.frames_per_s, (1000 * this.#bytes) / this.limits.bytes_per_s);
-  }
-
-  /** @param {{blob: Blob, width: number, height: number}} frame */
-  #exceedsLimits(frame) {
-    if (this.limits === null) return false;
-    return frame.blob.size > this.limits.max_bytes || frame.width * frame.height > this.limits.max_pixels;
   }
 
   /**

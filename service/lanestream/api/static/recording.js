@@ -4,24 +4,21 @@ const TYPES = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/mp4;code
 const FPS = 30;
 const BITS_PER_S = 6_000_000;
 
+/** @typedef {import("./session.js").LanePane} LanePane */
+
 /**
  * @typedef {object} RecordedFile
  * @property {string} name
  * @property {Blob} blob
  */
 
-export class Recording {
+class Recording {
   #recorder;
   #name;
   /** @type {Blob[]} */
   #chunks = [];
   /** @type {string[]} */
   #lines = [];
-
-  /** Whether this browser can record a canvas. */
-  static get isSupported() {
-    return "MediaRecorder" in window && TYPES.some((type) => MediaRecorder.isTypeSupported(type));
-  }
 
   /**
    * Starts at once.
@@ -52,6 +49,45 @@ export class Recording {
       { name: `${this.#name}.${type.startsWith("video/mp4") ? "mp4" : "webm"}`, blob: new Blob(this.#chunks, { type }) },
       { name: `${this.#name}.jsonl`, blob: new Blob(this.#lines, { type: "application/jsonl" }) },
     ];
+  }
+}
+
+/** The recordings of all panes, which start and stop together. */
+export class Recordings {
+  /** @type {Map<LanePane, Recording>} */
+  #running = new Map();
+
+  /** Whether this browser can record a canvas. */
+  static get areSupported() {
+    return "MediaRecorder" in window && TYPES.some((type) => MediaRecorder.isTypeSupported(type));
+  }
+
+  get areRunning() {
+    return this.#running.size > 0;
+  }
+
+  /** @param {LanePane[]} panes */
+  start(panes) {
+    const name = nameNow();
+    for (const pane of panes) {
+      const suffix = panes.length > 1 ? `-${pane.ready?.detector}` : "";
+      this.#running.set(pane, new Recording(pane.canvas, name + suffix));
+    }
+  }
+
+  /**
+   * Adds the answer that a pane shows.
+   * @param {LanePane} pane
+   */
+  add(pane) {
+    if (pane.answer) this.#running.get(pane)?.add(pane.answer);
+  }
+
+  /** @returns {Promise<RecordedFile[]>} the files of all panes */
+  async stop() {
+    const recordings = [...this.#running.values()];
+    this.#running.clear();
+    return (await Promise.all(recordings.map((recording) => recording.stop()))).flat();
   }
 }
 

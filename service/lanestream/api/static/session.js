@@ -246,6 +246,11 @@ export class LiveSession {
       frame.picture.close();
       return;
     }
+    if (!this.pacing.accepts(frame, now())) {
+      frame.picture.close();
+      this.#listener.onPlan();
+      return;
+    }
     this.#frames.add(frame);
     for (const pane of this.panes) pane.send(frame);
     this.#listener.onRoom(this.hasRoom);

@@ -8,7 +8,6 @@
  * @property {{height: number, fov: number} | null | undefined} camera meters and degrees; null for none, undefined for
  *   that of the source, if it is known
  * @typedef {"marking" | "road_edge"} Kind
- * @typedef {"curl" | "python" | "javascript"} Language
  */
 
 /** The camera of the demo clip: tools/demo_clip.py renders it with these values. */

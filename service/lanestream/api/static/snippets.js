@@ -2,11 +2,12 @@
 
 /**
  * @typedef {import("./settings.js").Settings} Settings
+ * @typedef {"curl" | "python" | "javascript"} Language
  * @typedef {{url: string, needsKey: boolean, detector: string | null, settings: Settings, camera: Settings["camera"]}} Situation
  */
 
 /**
- * @param {import("./settings.js").Language} language
+ * @param {Language} language
  * @param {Situation} situation
  */
 export function snippet(language, situation) {
