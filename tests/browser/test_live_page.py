@@ -249,6 +249,8 @@ def own_address() -> str:
 
 
 def test_after_a_broken_connection_the_ids_are_the_same(playing: LivePage) -> None:
+    # New tracks don't survive a gap.
+    playing.wait_until_drawn(15)
     playing.wait_for_ego_lane()
     before = set(playing.shown("ego").split())
     playing.page.keyboard.press("b")
@@ -268,7 +270,7 @@ def test_the_page_goes_on_after_a_restart(
         with processes.service(**settings) as (process, url):
             live.open(url, REGRESSION)
             live.page.keyboard.press("d")
-            live.wait_until_drawn(5)
+            live.wait_until_drawn(15)
             live.wait_for_ego_lane()
             before = live.shown("ego").split()
             process.send_signal(signal.SIGTERM)
@@ -393,6 +395,7 @@ def test_the_javascript_program_runs(live: LivePage, service: str, road_frames: 
 
 
 def test_a_changed_setting_keeps_the_session(playing: LivePage) -> None:
+    playing.wait_until_drawn(15)
     playing.wait_for_ego_lane()
     before = set(playing.shown("ego").split())
     playing.page.locator("[name=height]").fill("2")

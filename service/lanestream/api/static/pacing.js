@@ -50,7 +50,7 @@ export class Pacing {
   }
 
   /**
-   * Considers an answered frame. Returns whether the plan has changed.
+   * Considers an answered frame. Returns whether the plan may have changed.
    * @param {{encode: number, network: number, decode: number}} stages in milliseconds
    * @param {{blob: Blob, width: number, height: number}} frame
    * @param {number} now in milliseconds
@@ -70,9 +70,7 @@ export class Pacing {
       this.#hasGrown = true;
       return this.#goTo(this.#step + 1, now);
     }
-    this.#costs = [];
-    this.#reviewed = now;
-    return false;
+    return this.#goTo(this.#step, now, this.#good);
   }
 
   get #intervalMs() {
@@ -81,15 +79,16 @@ export class Pacing {
   }
 
   /**
+   * Ends a review. Returns true: the size or the pace may have changed.
    * @param {number} step
    * @param {number} now
+   * @param {number} good reviews in a row at this step
    */
-  #goTo(step, now) {
-    const changes = step >= 0 && step !== this.#step;
+  #goTo(step, now, good = 0) {
     this.#step = Math.max(0, step);
     this.#costs = [];
-    this.#good = 0;
+    this.#good = good;
     this.#reviewed = now;
-    return changes;
+    return true;
   }
 }
