@@ -194,7 +194,7 @@ def test_a_screen_streams_until_it_is_not_shared_any_more(live: LivePage, servic
     expect(live.page.locator("#welcome")).to_be_visible()
 
 
-def test_a_camera_goes_on_in_a_hidden_page(live: LivePage, service: str) -> None:
+def test_sources_go_on_in_a_hidden_page(live: LivePage, service: str) -> None:
     # Animation frames and timers of the page stand still, as in a tab in the background.
     live.page.add_init_script(
         "requestAnimationFrame = () => 0; HTMLVideoElement.prototype.requestVideoFrameCallback = () => 0;"
@@ -204,6 +204,7 @@ def test_a_camera_goes_on_in_a_hidden_page(live: LivePage, service: str) -> None
     live.wait_until_drawn(5)
     live.page.keyboard.press("d")
     live.wait_until_drawn(5)
+    expect(live.page.locator("#snapshot")).to_be_enabled()
 
 
 def test_a_file_that_is_not_a_video_is_explained(

@@ -20,8 +20,7 @@ export class Access {
   }
 
   /**
-   * Asks the visitor for a key until the service accepts one. Returns whether there is a token now; false if the visitor
-   * gave up.
+   * Asks the visitor for a key until the service accepts one. Returns false if the visitor gives up.
    * @param {string} reason shown in the dialog
    */
   async ask(reason = "") {
@@ -71,7 +70,8 @@ export class Access {
     if (response.ok) return String((await response.json()).token);
     const problem = await response.json().catch(() => ({}));
     const code = problem.code ?? (response.status === 401 ? "unauthorized" : "internal");
-    if (code === "unauthorized") throw new Problem("The service does not know this key", "Check it, or ask whoever runs the service for one");
+    if (code === "unauthorized")
+      throw new Problem("The service does not know this key", "Check it, or ask whoever runs the service for one");
     const message = problem.message ?? problem.detail ?? `the service replied with ${response.status}`;
     throw new Problem(explain({ code, message, hint: problem.hint }).replace(/\.$/, ""), "");
   }

@@ -6,8 +6,9 @@ import { Capture } from "./capture.js";
 import { LaneClient } from "./client/index.js";
 import { CodeView, copyText } from "./code-view.js";
 import { showConnection } from "./connection.js";
+import { listenForDrops } from "./drop.js";
 import { LatencyView } from "./latency.js";
-import { Notices, eventNotice } from "./notices.js";
+import { Notices, eventNotice, returnNotice } from "./notices.js";
 import { Problem, explain } from "./problems.js";
 import { Readings } from "./readings.js";
 import { Recordings, download, downloadLink, nameNow } from "./recording.js";
@@ -140,7 +141,9 @@ class LivePage {
     if (this.#recordings.areRunning) {
       await this.#stopRecording();
     } else if (!Recordings.areSupported) {
-      this.#notices.problem(new Problem("This browser can't record", "Use a current Chrome, Edge, Firefox or Safari").line);
+      this.#notices.problem(
+        new Problem("This browser can't record", "Use a current Chrome, Edge, Firefox or Safari").line,
+      );
     } else {
       this.#recordings.start(this.#session?.panes.filter((pane) => pane.frame !== null) ?? []);
       this.#show();
@@ -159,11 +162,15 @@ class LivePage {
 
   #connect() {
     this.#session?.close();
-    const client = new LaneClient(BASE, { reconnectS: RECONNECT_S, ...(this.#access.token ? { token: this.#access.token } : {}) });
+    const client = new LaneClient(BASE, {
+      reconnectS: RECONNECT_S,
+      ...(this.#access.token ? { token: this.#access.token } : {}),
+    });
     const session = new LiveSession(client, this.#options, {
       onDrawn: (pane, stages, drawn) => this.#session === session && this.#showAnswer(pane, stages, drawn),
       onState: () => this.#session === session && this.#show(),
-      onReturn: (pane, back) => this.#session === session && pane === session.panes[0] && this.#showReturn(back),
+      onReturn: (pane, back) =>
+        this.#session === session && pane === session.panes[0] && this.#notices.show(...returnNotice(back)),
       onError: (_, error) => this.#session === session && void this.#failed(error),
       onRoom: (hasRoom) => this.#session === session && this.#capture && (this.#capture.hasRoom = hasRoom),
       onPlan: () => this.#session === session && this.#capture && (this.#capture.plan = session.pacing.plan),
@@ -207,7 +214,8 @@ class LivePage {
     }
     if (error.code === "unauthorized") {
       this.#session?.close();
-      const reason = this.#access.token === null ? "" : "The token has expired or is not valid any more. Enter the key again.";
+      const reason =
+        this.#access.token === null ? "" : "The token has expired or is not valid any more. Enter the key again.";
       const hasToken = await this.#access.ask(reason);
       this.#show();
       if (hasToken && this.#capture) {
@@ -221,7 +229,8 @@ class LivePage {
 
   #applySettings() {
     const hash = hashFromSettings(this.#form.settings);
-    if (hash !== location.hash) history.replaceState(null, "", hash === "" ? location.pathname + location.search : hash);
+    if (hash !== location.hash)
+      history.replaceState(null, "", hash === "" ? location.pathname + location.search : hash);
     const options = this.#options;
     if (this.#session !== null) {
       if (options.length === this.#session.panes.length) this.#session.restart(options);
@@ -249,10 +258,11 @@ class LivePage {
     this.#recordings.add(pane);
     if (this.#session?.panes.length === 2) {
       const caption = pane.canvas.nextElementSibling;
-      if (caption) caption.textContent = `${pane.ready?.detector} · ${answer.timing_ms.total.toFixed(0)} ms in the service`;
+      const text = `${pane.ready?.detector} · ${answer.timing_ms.total.toFixed(0)} ms in the service`;
+      if (caption) caption.textContent = text;
     }
     if (pane !== this.#session?.panes[0]) return;
-    if (this.#drawn === 0 || element("panes").hidden) this.#show();
+    if (/** @type {HTMLButtonElement} */ (element("snapshot")).disabled) this.#show();
     this.#drawn += 1;
     this.#readings.show(answer);
     drawMap(element("map"), answer.lanes, pane.unseen);
@@ -266,14 +276,6 @@ class LivePage {
     element("sent").textContent =
       `Sent as ${frame.width} × ${frame.height} JPEG, ${Math.round(frame.blob.size / 1000)} KB` +
       ` to ${pane.ready?.model ?? "the service"} on ${pane.ready?.provider ?? "?"}.`;
-  }
-
-  /** @param {import("./session.js").Return} back */
-  #showReturn({ resumed, seconds, kept }) {
-    const after = `Back after ${seconds.toFixed(1)} s`;
-    if (!resumed) this.#notices.show(`${after} in a new session: ids start again`, "caution");
-    else if (kept.length === 0) this.#notices.show(`${after} in the same session`, "good");
-    else this.#notices.show(`${after}: ${kept.length === 1 ? "line" : "lines"} ${list(kept)} kept ${kept.length === 1 ? "its id" : "their ids"}`, "good");
   }
 
   /** Shows the state of everything but the answers. */
@@ -292,7 +294,8 @@ class LivePage {
     element("panes").hidden = !isRunning;
     showConnection(element("connection"), worst);
     for (const button of document.querySelectorAll(".toolbar [data-source]")) {
-      button.setAttribute("aria-pressed", String(/** @type {HTMLElement} */ (button).dataset.source === this.#capture?.kind));
+      const isChosen = button.getAttribute("data-source") === this.#capture?.kind;
+      button.setAttribute("aria-pressed", String(isChosen));
     }
     for (const id of ["pause", "stop", "break"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !isRunning;
     for (const id of ["snapshot", "record"]) /** @type {HTMLButtonElement} */ (element(id)).disabled = !hasPicture;
@@ -333,8 +336,8 @@ class LivePage {
   }
 
   #wire() {
-    for (const button of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll("[data-source]"))) {
-      if (button instanceof HTMLButtonElement) button.addEventListener("click", () => this.#choose(/** @type {SourceKind} */ (button.dataset.source)));
+    for (const button of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll("button[data-source]"))) {
+      button.addEventListener("click", () => this.#choose(/** @type {SourceKind} */ (button.dataset.source)));
     }
     const file = /** @type {HTMLInputElement} */ (element("file"));
     file.addEventListener("change", () => {
@@ -369,36 +372,13 @@ class LivePage {
       escape: actions.stop,
       "?": actions["help-open"],
     });
-    this.#wireDrop();
+    listenForDrops(element("drop-hint"), (video) => void this.start("file", video));
     addEventListener("hashchange", () => this.#form.replace(settingsFromHash(location.hash)));
     addEventListener("resize", () => {
       const pane = this.#session?.panes[0];
       drawMap(element("map"), pane?.answer?.lanes ?? [], pane?.unseen ?? (() => 0));
     });
   }
-
-  #wireDrop() {
-    const hint = element("drop-hint");
-    addEventListener("dragover", (event) => {
-      if (!event.dataTransfer?.types.includes("Files")) return;
-      event.preventDefault();
-      hint.hidden = false;
-    });
-    addEventListener("dragleave", (event) => {
-      if (event.relatedTarget === null) hint.hidden = true;
-    });
-    addEventListener("drop", (event) => {
-      event.preventDefault();
-      hint.hidden = true;
-      const [video] = event.dataTransfer?.files ?? [];
-      if (video) void this.start("file", video);
-    });
-  }
-}
-
-/** @param {number[]} ids */
-function list(ids) {
-  return ids.length < 2 ? ids.join("") : `${ids.slice(0, -1).join(", ")} and ${ids.at(-1)}`;
 }
 
 restoreTheme();

@@ -47,7 +47,13 @@ export function drawMap(canvas, lanes, unseen) {
   context.fillStyle = "#e8ecf0";
   const half = VEHICLE.width / 2;
   context.beginPath();
-  context.roundRect(map.column(half), map.row(0), map.column(-half) - map.column(half), map.row(-VEHICLE.length) - map.row(0), 5);
+  context.roundRect(
+    map.column(half),
+    map.row(0),
+    map.column(-half) - map.column(half),
+    map.row(-VEHICLE.length) - map.row(0),
+    5,
+  );
   context.fill();
 }
 
@@ -122,7 +128,10 @@ function drawLine({ context, column, row }, lane, style) {
   context.globalAlpha = style.alpha;
   for (const [start, end] of style.pieces) {
     for (const strand of style.strands) {
-      for (const [color, width] of /** @type {[string | null, number][]} */ ([[style.color, 3 * strand.width], [style.core, 1]])) {
+      for (const [color, width] of /** @type {[string | null, number][]} */ ([
+        [style.color, 3 * strand.width],
+        [style.core, 1],
+      ])) {
         if (color === null) continue;
         context.strokeStyle = color;
         context.lineWidth = width;

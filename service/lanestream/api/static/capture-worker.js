@@ -1,10 +1,10 @@
 /**
- * Turns frames into JPEG images in a worker, and paces them with its own timer: browsers slow those of hidden pages down.
+ * Turns frames into JPEG images in a worker, and paces them with its own timer: in hidden pages, browsers slow timers.
  *
  * Messages in: `track` (read this stream of VideoFrames), `pull` (ask the page for frames), `frame` (the page's reply),
- * `plan` (size, quality and pace), `room` (whether the service can take another frame), `pause` and `stop`.
- * Messages out: `tick` (the page should reply with a frame if it has a new one), `image` (an encoded frame), `ended` (the
- * track has no more frames) and `failed`.
+ * `plan` (size, quality and pace), `room` (whether the service can take another frame) and `pause`.
+ * Messages out: `tick` (the page should reply with a frame if it has a new one), `image` (an encoded frame), `ended`
+ * (the track has no more frames) and `failed`.
  */
 
 // Pictures on the page are at most this wide, however wide the source is.
@@ -103,7 +103,8 @@ class FrameEncoder {
     const started = now();
     this.#lastStart = started;
     try {
-      const [width, height] = "displayWidth" in source ? [source.displayWidth, source.displayHeight] : [source.width, source.height];
+      const [width, height] =
+        "displayWidth" in source ? [source.displayWidth, source.displayHeight] : [source.width, source.height];
       const viewSize = fitted(width, height, MOST_VIEW_WIDTH);
       const sentSize = fitted(width, height, this.#plan.width);
       this.#view.draw(source, ...viewSize);
@@ -113,7 +114,17 @@ class FrameEncoder {
       const { canvas } = isSameSize ? this.#view : this.#sent;
       const blob = await canvas.convertToBlob({ type: "image/jpeg", quality: this.#plan.quality });
       const picture = this.#view.canvas.transferToImageBitmap();
-      const frame = { seq: this.#seq, timestamp, captured, started, encoded: now(), picture, blob, width: sentSize[0], height: sentSize[1] };
+      const frame = {
+        seq: this.#seq,
+        timestamp,
+        captured,
+        started,
+        encoded: now(),
+        picture,
+        blob,
+        width: sentSize[0],
+        height: sentSize[1],
+      };
       this.#seq += 1;
       self.postMessage({ type: "image", frame }, { transfer: [picture] });
     } catch (error) {

@@ -52,7 +52,10 @@ export class Capture {
     this.#listener = listener;
     this.#worker = new Worker(new URL("capture-worker.js", import.meta.url), { type: "module" });
     this.#worker.onmessage = ({ data }) => this.#receive(data);
-    this.#worker.onerror = () => this.#end(new Problem("Frames can't be encoded in this browser", "Use a current Chrome, Edge, Firefox or Safari"));
+    this.#worker.onerror = () =>
+      this.#end(
+        new Problem("Frames can't be encoded in this browser", "Use a current Chrome, Edge, Firefox or Safari"),
+      );
   }
 
   /**
@@ -115,7 +118,8 @@ export class Capture {
     if (message.type === "image") this.#listener.onFrame(message.frame);
     if (message.type === "tick") void this.#reply();
     if (message.type === "ended") this.#end(null);
-    if (message.type === "failed") this.#end(new Problem(`A frame can't be encoded: ${message.message}`, "Try a smaller video"));
+    if (message.type === "failed")
+      this.#end(new Problem(`A frame can't be encoded: ${message.message}`, "Try a smaller video"));
   }
 
   /** @param {string | File} source */
@@ -142,7 +146,12 @@ export class Capture {
       this.#stream =
         kind === "camera"
           ? await navigator.mediaDevices.getUserMedia({
-              video: { facingMode: "environment", width: { ideal: 1280 }, height: { ideal: 720 }, frameRate: { ideal: 30 } },
+              video: {
+                facingMode: "environment",
+                width: { ideal: 1280 },
+                height: { ideal: 720 },
+                frameRate: { ideal: 30 },
+              },
             })
           : await navigator.mediaDevices.getDisplayMedia({ video: { frameRate: { ideal: 30 } } });
     } catch (error) {
@@ -150,7 +159,9 @@ export class Capture {
     }
     const [track] = this.#stream.getVideoTracks();
     track.addEventListener("ended", () =>
-      this.#end(kind === "screen" ? null : new Problem("The camera was disconnected", "Connect it, then start it again")),
+      this.#end(
+        kind === "screen" ? null : new Problem("The camera was disconnected", "Connect it, then start it again"),
+      ),
     );
     const Processor = /** @type {any} */ (window).MediaStreamTrackProcessor;
     if (Processor) {

@@ -15,6 +15,8 @@ const FORESHORTENING = 1.6;
 const CORE = 0.45;
 const TICKS = 12;
 const TICK_LENGTH = 6;
+// A boundary that ends in this share of the picture at its side leaves it there.
+const SIDE = 0.01;
 const DARK = "rgba(12, 16, 20, 0.85)";
 
 /**
@@ -50,7 +52,10 @@ export function drawHorizon(context, fraction) {
   context.setTransform(1, 0, 0, 1, 0, 0);
   context.save();
   context.setLineDash([width / 80, width / 80]);
-  for (const [color, lineWidth] of /** @type {[string, number][]} */ ([[DARK, 4], ["#ffffff", 2]])) {
+  for (const [color, lineWidth] of /** @type {[string, number][]} */ ([
+    [DARK, 4],
+    ["#ffffff", 2],
+  ])) {
     context.strokeStyle = color;
     context.lineWidth = (lineWidth * width) / 1280;
     context.beginPath();
@@ -70,20 +75,35 @@ function fillEgoLane(context, answer) {
   const left = answer.lanes.find((lane) => lane.track_id === answer.ego.left);
   const right = answer.lanes.find((lane) => lane.track_id === answer.ego.right);
   if (!left || !right) return;
-  const bottom = Math.min(left.line.bottom[1], right.line.bottom[1]);
+  const [[leftX, leftY], [rightX, rightY]] = [left.line.bottom, right.line.bottom];
   const top = Math.max(left.line.top[1], right.line.top[1]);
-  if (bottom - top < 2) return;
+  // Where a boundary leaves the picture sideways, the lane goes on along the picture's edge, as low as the other one.
+  const leavesLeft = leftX < SIDE * answer.width && leftY < rightY;
+  const leavesRight = rightX > (1 - SIDE) * answer.width && rightY < leftY;
+  const bottom = leavesLeft || leavesRight ? Math.max(leftY, rightY) : Math.min(leftY, rightY);
+  if (Math.min(leftY, rightY) - top < 2) return;
   const fading = context.createLinearGradient(0, top, 0, bottom);
   fading.addColorStop(0, `rgba(${EGO_LANE}, 0)`);
   fading.addColorStop(0.35, `rgba(${EGO_LANE}, 0.16)`);
   fading.addColorStop(1, `rgba(${EGO_LANE}, 0.36)`);
   context.globalAlpha = 1;
   context.fillStyle = fading;
-  const rows = Array.from({ length: SAMPLES }, (_, n) => bottom + ((top - bottom) * n) / (SAMPLES - 1));
   context.beginPath();
-  for (const y of rows) context.lineTo(laneX(left, y), y);
-  for (const y of rows.reverse()) context.lineTo(laneX(right, y), y);
+  if (leavesLeft) for (const y of [bottom, leftY]) context.lineTo(-1, y);
+  for (const y of rowsBetween(Math.min(leftY, bottom), top, SAMPLES)) context.lineTo(laneX(left, y), y);
+  for (const y of rowsBetween(top, Math.min(rightY, bottom), SAMPLES)) context.lineTo(laneX(right, y), y);
+  if (leavesRight) for (const y of [rightY, bottom]) context.lineTo(answer.width, y);
   context.fill();
+}
+
+/**
+ * Returns evenly spaced rows, with both ends.
+ * @param {number} first
+ * @param {number} last
+ * @param {number} count
+ */
+function rowsBetween(first, last, count) {
+  return Array.from({ length: count }, (_, n) => first + ((last - first) * n) / (count - 1));
 }
 
 /**
@@ -99,8 +119,7 @@ function drawBoundary(context, lane, style, answer, scale) {
   if (style.ticks !== 0) drawTicks(context, lane, style, road);
   const samples = Math.max(3, Math.round(SAMPLES / style.pieces.length));
   for (const [start, end] of style.pieces) {
-    const [first, last] = [rowAt(lane, start), rowAt(lane, end)];
-    const rows = Array.from({ length: samples }, (_, n) => first + ((last - first) * n) / (samples - 1));
+    const rows = rowsBetween(rowAt(lane, start), rowAt(lane, end), samples);
     for (const strand of style.strands) {
       fillRibbon(context, lane, rows, strand, DARK, 1.3 * scale, road);
       fillRibbon(context, lane, rows, strand, style.color, 0, road);

@@ -19,7 +19,10 @@ const BY_STATE = { detected: [1, 1], inferred: [4, 0.8], predicted: [8, 0.5] };
 /** @type {Record<string, [number, number]>} */
 const BY_TYPE = { dashed: [7, 0.5], dots: [18, 0.3] };
 const SINGLE = [{ middle: 0, width: 1 }];
-const DOUBLE = [{ middle: -0.65, width: 0.5 }, { middle: 0.65, width: 0.5 }];
+const DOUBLE = [
+  { middle: -0.65, width: 0.5 },
+  { middle: 0.65, width: 0.5 },
+];
 const THIN = [{ middle: 0, width: 0.5 }];
 /** A predicted boundary fades to a third of its strength within this many seconds. */
 const FADING_S = 1.5;

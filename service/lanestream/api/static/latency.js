@@ -121,8 +121,16 @@ export class LatencyView {
       const element = this.#root.querySelector(`#${id}`);
       if (element) element.textContent = text;
     }
-    const medians = STAGES.map(([name]) => quantile(this.#frames.map((frame) => frame[/** @type {keyof Stages} */ (name)]), 0.5));
-    const whole = Math.max(1, medians.reduce((sum, value) => sum + value, 0));
+    const medians = STAGES.map(([name]) =>
+      quantile(
+        this.#frames.map((frame) => frame[/** @type {keyof Stages} */ (name)]),
+        0.5,
+      ),
+    );
+    const whole = Math.max(
+      1,
+      medians.reduce((sum, value) => sum + value, 0),
+    );
     let start = 0;
     STAGES.forEach(([name], index) => {
       const cell = this.#cells.get(name);

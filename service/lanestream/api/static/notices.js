@@ -96,3 +96,16 @@ export function eventNotice(event) {
       return ["Something this page does not know has happened", "info"];
   }
 }
+
+/**
+ * Returns what became of a session whose connection was lost.
+ * @param {import("./session.js").Return} back
+ * @returns {[string, "good" | "caution"]}
+ */
+export function returnNotice({ resumed, seconds, kept }) {
+  const after = `Back after ${seconds.toFixed(1)} s`;
+  if (!resumed) return [`${after} in a new session: ids start again`, "caution"];
+  if (kept.length === 0) return [`${after} in the same session`, "good"];
+  if (kept.length === 1) return [`${after}: line ${kept[0]} kept its id`, "good"];
+  return [`${after}: lines ${kept.slice(0, -1).join(", ")} and ${kept.at(-1)} kept their ids`, "good"];
+}

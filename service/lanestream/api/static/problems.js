@@ -18,7 +18,10 @@ export class Problem extends Error {
 /** @type {Record<string, [string, string]>} */
 const BY_CODE = {
   unauthorized: ["The service does not accept this key or token", "Enter a valid API key"],
-  forbidden: ["The service does not accept this page's address", "Add it to LANESTREAM_ALLOWED_ORIGINS, or open the page under the service's own address"],
+  forbidden: [
+    "The service does not accept this page's address",
+    "Add it to LANESTREAM_ALLOWED_ORIGINS, or open the page under the service's own address",
+  ],
   busy: ["The service is busy", "Close other streams, or try again in a moment"],
   draining: ["The service is about to stop", "The page goes on by itself once it is back"],
   not_ready: ["The service is still starting", "The page goes on by itself once it is ready"],
@@ -32,7 +35,10 @@ const BY_CODE = {
 
 /** @type {Record<string, [string, string]>} by the name of the exception */
 const CAMERA = {
-  NotAllowedError: ["The browser may not use the camera", "Allow it in the browser's settings of this site, then try again"],
+  NotAllowedError: [
+    "The browser may not use the camera",
+    "Allow it in the browser's settings of this site, then try again",
+  ],
   NotFoundError: ["No camera was found", "Connect one, or play a video file"],
   OverconstrainedError: ["No suitable camera was found", "Connect another one, or play a video file"],
   NotReadableError: ["The camera can't be read", "Close other programs that use it, then try again"],
@@ -84,7 +90,10 @@ export function insecureProblem() {
  */
 export function videoProblem(error, name) {
   if (error?.code === 2) return new Problem(`${name} could not be loaded`, "Check the connection, then try again");
-  return new Problem(`This browser can't play ${name}`, "Convert it to H.264 in MP4 or to VP9 in WebM, for example with ffmpeg");
+  return new Problem(
+    `This browser can't play ${name}`,
+    "Convert it to H.264 in MP4 or to VP9 in WebM, for example with ffmpeg",
+  );
 }
 
 /** @param {string} text */

@@ -35,7 +35,8 @@ export class Readings {
 
   clear() {
     for (const id of ["reading-offset", "reading-width", "reading-radius"]) this.#text(id, "–");
-    for (const mark of this.#find("offset").querySelectorAll("i.spread, i.vehicle")) /** @type {HTMLElement} */ (mark).hidden = true;
+    for (const mark of this.#find("offset").querySelectorAll("i.spread, i.vehicle"))
+      /** @type {HTMLElement} */ (mark).hidden = true;
     this.#find("lanes").querySelector("tbody")?.replaceChildren();
   }
 
@@ -46,7 +47,10 @@ export class Readings {
   #showOffset(ego, state) {
     const bar = this.#find("offset");
     bar.dataset.state = state;
-    const [spread, vehicle] = /** @type {HTMLElement[]} */ ([bar.querySelector(".spread"), bar.querySelector(".vehicle")]);
+    const [spread, vehicle] = /** @type {HTMLElement[]} */ ([
+      bar.querySelector(".spread"),
+      bar.querySelector(".vehicle"),
+    ]);
     spread.hidden = vehicle.hidden = ego.offset === null;
     if (ego.offset === null) return;
     const sigma = ego.offset_sigma ?? 0;
@@ -65,7 +69,8 @@ export class Readings {
     sorted.forEach((lane, index) => {
       const row = body.rows[index] ?? newRow(body);
       const [id, position, kind, probability] = row.cells;
-      /** @type {HTMLElement} */ (id.firstElementChild).style.background = lane.kind === "road_edge" ? "" : positionColor(lane.position);
+      /** @type {HTMLElement} */ (id.firstElementChild).style.background =
+        lane.kind === "road_edge" ? "" : positionColor(lane.position);
       setText(/** @type {HTMLElement} */ (id.firstElementChild), String(lane.track_id));
       setText(position, positionName(lane.position));
       setText(kind, lineName(lane));

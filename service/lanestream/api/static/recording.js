@@ -46,7 +46,10 @@ class Recording {
     for (const track of this.#recorder.stream.getTracks()) track.stop();
     const type = this.#recorder.mimeType;
     return [
-      { name: `${this.#name}.${type.startsWith("video/mp4") ? "mp4" : "webm"}`, blob: new Blob(this.#chunks, { type }) },
+      {
+        name: `${this.#name}.${type.startsWith("video/mp4") ? "mp4" : "webm"}`,
+        blob: new Blob(this.#chunks, { type }),
+      },
       { name: `${this.#name}.jsonl`, blob: new Blob(this.#lines, { type: "application/jsonl" }) },
     ];
   }

@@ -75,7 +75,10 @@ export class LanePane {
     this.#listener = listener;
     this.#context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d", { alpha: false }));
     this.canvas.setAttribute("role", "img");
-    this.canvas.setAttribute("aria-label", `The picture with its lanes${options.detector ? `, detector ${options.detector}` : ""}`);
+    this.canvas.setAttribute(
+      "aria-label",
+      `The picture with its lanes${options.detector ? `, detector ${options.detector}` : ""}`,
+    );
     // Asking for the width at every frame would have the browser lay out the page each time.
     new ResizeObserver(([{ contentRect }]) => (this.#shownWidth = contentRect.width)).observe(this.canvas);
     this.#stream = client.stream({ ...options, mode: "latest" });
@@ -159,7 +162,10 @@ export class LanePane {
     this.#publish(answer, frame, stages);
     this.#listener.onDrawn(this, stages, drawn);
     if (this.#lost === null) return;
-    const kept = answer.lanes.map((lane) => lane.track_id).filter((id) => this.#lost?.ids.includes(id));
+    const kept = answer.lanes
+      .map((lane) => lane.track_id)
+      .filter((id) => this.#lost?.ids.includes(id))
+      .sort((a, b) => a - b);
     const back = { resumed: this.resumed === true, seconds: (answered - this.#lost.at) / 1000, kept };
     this.#lost = null;
     this.#listener.onReturn(this, back);
@@ -185,7 +191,8 @@ export class LanePane {
   #remember(answer) {
     const ids = new Set(answer.lanes.map((lane) => lane.track_id));
     for (const id of this.#detected.keys()) if (!ids.has(id)) this.#detected.delete(id);
-    for (const lane of answer.lanes) if (lane.state !== "predicted") this.#detected.set(lane.track_id, answer.timestamp);
+    for (const lane of answer.lanes)
+      if (lane.state !== "predicted") this.#detected.set(lane.track_id, answer.timestamp);
   }
 
   /**

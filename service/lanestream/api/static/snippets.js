@@ -3,7 +3,12 @@
 /**
  * @typedef {import("./settings.js").Settings} Settings
  * @typedef {"curl" | "python" | "javascript"} Language
- * @typedef {{url: string, needsKey: boolean, detector: string | null, settings: Settings, camera: Settings["camera"]}} Situation
+ * @typedef {object} Situation
+ * @property {string} url of the service, with a slash at its end
+ * @property {boolean} needsKey
+ * @property {string | null} detector
+ * @property {Settings} settings
+ * @property {Settings["camera"]} camera the one in use
  */
 
 /**
@@ -62,10 +67,12 @@ function javascript({ url, needsKey, detector, settings, camera }) {
     ...(camera ? [`camera: { height: ${camera.height}, field_of_view: ${camera.fov} }`] : []),
     ...(settings.kinds === null ? [] : [`kinds: [${settings.kinds.map((kind) => `"${kind}"`).join(", ")}]`]),
   ];
+  const token = needsKey ? ", { token }" : "";
   return [
+    ...(needsKey ? ["// A token from POST /v1/tokens, which your own server exchanges for the key.", ""] : []),
     `import { LaneClient } from "${url}static/client/index.js";`,
     "",
-    `const client = new LaneClient("${bare(url)}"${needsKey ? ", { token }" : ""});${needsKey ? " // from POST /v1/tokens" : ""}`,
+    `const client = new LaneClient("${bare(url)}"${token});`,
     `const stream = client.stream({ ${options.join(", ")} });`,
     'stream.on("lanes", (answer) => console.log(answer.seq, answer.ego));',
     "stream.send(jpeg, { seq: 0, timestamp: 0 }); // a Blob, and its capture time in seconds",
