@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -86,6 +86,10 @@ attack: $(DEV_READY)
 
 asyncapi: $(DEV_READY)
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml
+
+# Updates what the Helm chart repeats: the version, the alerts, and the names and types of settings.
+chart: $(DEV_READY)
+	$(BIN)/python tools/chart.py
 
 # Needs npm: the schema of AsyncAPI documents is published only there.
 asyncapi-check: $(DEV_READY)
