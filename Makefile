@@ -116,8 +116,8 @@ BUILD_REQUIREMENTS := import tomllib; print(*tomllib.load(open("pyproject.toml",
 # Locks the packages of the images, and those that build our own: the newest versions that pyproject.toml allows.
 lock: | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster -o docker/requirements-cpu.txt pyproject.toml
-	$(LOCK) --extra service --extra gpu --extra cluster -o docker/requirements-gpu.txt pyproject.toml
+	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster --extra tracing -o docker/requirements-cpu.txt pyproject.toml
+	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
 picture: $(RUN_READY)

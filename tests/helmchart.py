@@ -55,6 +55,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "hpa": {**BASE, "autoscaling": {"kind": "hpa"}, "metrics": SCRAPED},
     "keda": {**BASE, "autoscaling": {"kind": "keda", "prometheusUrl": "http://prometheus:9090"}, "metrics": SCRAPED},
     "ingress": {**BASE, "ingress": INGRESS, "trustedProxies": "10.0.0.0/8", "settings": {"max_bytes": 16 << 20}},
+    "traces": {
+        **BASE,
+        "tracing": {"endpoint": "http://collector.monitoring:4318", "sampleRatio": 0.001},
+        "networkPolicy": {"collector": [{"podSelector": {"matchLabels": {"app": "collector"}}}]},
+    },
     "everything": {
         **BASE,
         "ingress": {**INGRESS, "annotations": {"cert-manager.io/cluster-issuer": "letsencrypt"}},

@@ -232,7 +232,7 @@ async def detect(
     with service.answering(request, caller):
         async with service.bodies.image(request, caller.quota) as data:
             with service.sessions.temporary(pool, caller, options) as session:
-                frame = await _process(service, session, caller, data)
+                frame = await _process(service, session, caller, data, request)
                 message = lanes_message(frame, seq=0, timestamp=0.0)
                 if media_type == _JSON:
                     return Response(message.model_dump_json(), media_type=_JSON)
@@ -376,8 +376,11 @@ def _response_media_type(request: Request, service: Service) -> str:
     return media_type
 
 
-async def _process(service: Service, session: OpenSession, caller: Caller, data: bytes) -> ProcessedFrame:
-    """Returns the lanes of an image. Counts the frame, processed or failed."""
+async def _process(
+    service: Service, session: OpenSession, caller: Caller, data: bytes, request: Request
+) -> ProcessedFrame:
+    """Returns the lanes of an image. Counts and traces the frame, processed or failed."""
+    attributes = {"caller": caller.identity}
     service.metrics.frame_received()
     arrived = time.monotonic()
     image = EncodedFrame(data, 0.0, arrived, arrived + service.settings.body_s)
@@ -386,7 +389,11 @@ async def _process(service: Service, session: OpenSession, caller: Caller, data:
             frame = await service.pool.run(session.handle, image, slot)
     except BaseException as error:
         service.metrics.frame_failed(error)
+        if service.tracer is not None:
+            service.tracer.record(arrived, attributes, error=error, headers=request.headers)
         raise
+    if service.tracer is not None:
+        service.tracer.record(arrived, attributes, frame.result.timing_ms, headers=request.headers)
     service.metrics.frame_processed(frame.result.timing_ms, time.monotonic() - image.arrived)
     return frame
 

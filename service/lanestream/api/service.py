@@ -17,6 +17,7 @@ from lanestream.api.byte_budget import ByteBudget
 from lanestream.api.connections import ConnectionLimits, ConnectionTable, connection_of
 from lanestream.api.metrics import Metrics
 from lanestream.api.request_body import BodyLimits, BodyReader
+from lanestream.api.tracing import open_tracer
 from lanestream.asyncapi import document
 from lanestream.errors import DrainingError, NotReadyError, SettingsError
 from lanestream.protocol import Limits, json_schemas, read_camera_file
@@ -66,6 +67,7 @@ class Service:
         self.authenticator = Authenticator.from_settings(settings)
         self._camera = None if settings.camera is None else read_camera_file(settings.camera)
         self.metrics = Metrics()
+        self.tracer = open_tracer()
         self.budget = ByteBudget(settings.buffered_bytes)
         self.proxies = os.environ.get(_PROXIES_VARIABLE, "")
         self.connections = ConnectionTable(
@@ -188,6 +190,8 @@ class Service:
         await self._store.close()
         if pool is not None:
             await pool.close()
+        if self.tracer is not None:
+            await self.tracer.close()
 
 
 def proxy_check(proxies: str) -> Callable[[str], bool]:

@@ -42,7 +42,7 @@ from lanestream.streaming.stream_protocol import FrameOutcome, StreamProtocol, S
 from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from lanestream.api.service import Service
     from lanestream.messages import ProcessedFrame
@@ -269,12 +269,14 @@ class StreamConnection:
             if not isinstance(error, LanestreamError):
                 _log.exception("frame failed", extra=self._log_fields("frame_failed", frame.seq))
             self._service.metrics.frame_failed(error)
+            self._trace(session, frame, error=error)
             self._complete(session, FrameOutcome.EXPIRED if isinstance(error, ExpiredError) else FrameOutcome.FAILED)
             self._check_worker_losses(error)
             return error_message(error, seq=frame.seq)
         self._complete(session, FrameOutcome.ANSWERED)
         timing = processed.result.timing_ms
         self._service.metrics.frame_processed(timing, 1e-3 * timing["total"])
+        self._trace(session, frame, timing)
         self._warn(processed.result.warnings, frame.seq)
         return lanes_message(
             processed,
@@ -282,6 +284,22 @@ class StreamConnection:
             timestamp=frame.timestamp,
             dropped=self._protocol.dropped,
         )
+
+    def _trace(
+        self,
+        session: OpenSession,
+        frame: IncomingFrame,
+        timing_ms: Mapping[str, float] | None = None,
+        error: Exception | None = None,
+    ) -> None:
+        tracer = self._service.tracer
+        if tracer is not None:
+            attributes: dict[str, str | int] = {
+                "session": session.id,
+                "seq": frame.seq,
+                "caller": self._caller.identity,
+            }
+            tracer.record(frame.arrived, attributes, timing_ms, error)
 
     def _warn(self, codes: Sequence[WarningCode], seq: int) -> None:
         for code in codes:

@@ -34,6 +34,12 @@ from lanestream.settings import Settings, load_settings
 KUBERNETES = ("1.30", "1.37")
 # Their schemas are not part of Kubernetes.
 CUSTOM_KINDS = {"ServiceMonitor", "PrometheusRule", "ScaledObject"}
+OTHER_VARIABLES = {
+    "FORWARDED_ALLOW_IPS",
+    "OTEL_EXPORTER_OTLP_ENDPOINT",
+    "OTEL_TRACES_SAMPLER",
+    "OTEL_TRACES_SAMPLER_ARG",
+}
 COMPOSE = yaml.safe_load((ROOT / "docker/compose.yaml").read_text())
 
 
@@ -128,7 +134,7 @@ def test_the_service_accepts_its_variables(variant: str, monkeypatch: pytest.Mon
     variables = environment(variant)
     assert len(variables) == len(container(variant)["env"])
     for name, value in variables.items():
-        assert name == "FORWARDED_ALLOW_IPS" or name.removeprefix("LANESTREAM_").lower() in Settings.model_fields
+        assert name in OTHER_VARIABLES or name.removeprefix("LANESTREAM_").lower() in Settings.model_fields
         monkeypatch.setenv(name, value)
     settings = load_settings()
     assert settings.port == container(variant)["ports"][0]["containerPort"]
@@ -141,6 +147,14 @@ def test_the_service_accepts_its_variables(variant: str, monkeypatch: pytest.Mon
     assert (settings.redis_url is None) == (variant == "no-redis")
     assert (settings.api_keys_file is None) == (variant == "no-keys")
     assert (settings.token_secret is not None) == (variant == "secrets")
+
+
+def test_variables_of_other_programs_are_documented() -> None:
+    page = (ROOT / "docs/operations.md").read_text()
+    assert all(name in page for name in OTHER_VARIABLES)
+    traces = environment("traces")
+    assert {*traces} & OTHER_VARIABLES == {name for name in OTHER_VARIABLES if name.startswith("OTEL_")}
+    assert (traces["OTEL_TRACES_SAMPLER"], traces["OTEL_TRACES_SAMPLER_ARG"]) == ("traceidratio", "0.001")
 
 
 def test_a_setting_of_the_provider_takes_precedence() -> None:

@@ -59,7 +59,16 @@ def test_ports_agree(variant: str) -> None:
     assert set(probes) == {"http"}
 
 
-def test_network_policies_allow_dns_and_redis_only() -> None:
+@pytest.mark.parametrize(
+    ("endpoint", "port"), [("https://10.1.2.3", 443), ("http://collector/otlp", 80), ("https://collector:4318/", 4318)]
+)
+def test_the_port_of_the_collector_is_that_of_its_url(endpoint: str, port: int) -> None:
+    values = {**BASE, "redis": {"enabled": False}, "tracing": {"endpoint": endpoint}}
+    (policy,) = [each for each in rendered(values) if each["kind"] == "NetworkPolicy"]
+    assert policy["spec"]["egress"][1:] == [{"ports": [{"port": port, "protocol": "TCP"}]}]
+
+
+def test_network_policies_allow_dns_redis_and_the_collector_only() -> None:
     def destinations(variant: str) -> list[tuple[int, ...]]:
         rules = of_kind(variant, "NetworkPolicy")["spec"]["egress"]
         return [tuple(port["port"] for port in rule["ports"]) for rule in rules]
@@ -71,6 +80,9 @@ def test_network_policies_allow_dns_and_redis_only() -> None:
     alone = rendered({**BASE, "redis": {"enabled": False}})
     (policy,) = [each for each in alone if each["kind"] == "NetworkPolicy"]
     assert policy["spec"]["egress"] == []
+    assert destinations("traces") == [(53, 53), (6379,), (4318,)]
+    collector = VARIANTS["traces"]["networkPolicy"]["collector"]
+    assert of_kind("traces", "NetworkPolicy")["spec"]["egress"][2]["to"] == collector
     redis = of_kind("cpu", "NetworkPolicy", "redis")["spec"]
     assert redis["policyTypes"] == ["Ingress", "Egress"]
     assert redis["egress"] == []

@@ -34,6 +34,7 @@ def test_generated_files_are_up_to_date() -> None:
         ({"metrics": SCRAPED, "settings": {"metrics_access": "off"}}, "settings.metrics_access is off"),
         ({"autoscaling": {"kind": "keda"}}, "autoscaling.prometheusUrl is missing"),
         ({"autoscaling": {"kind": "vpa"}}, "at '/autoscaling/kind'"),
+        ({"tracing": {"endpoint": "collector:4318"}}, "at '/tracing/endpoint'"),
         ({"replicas": 3}, "additional properties 'replicas' not allowed"),
         ({"settings": {"max_sesions": 3}}, "additional properties 'max_sesions' not allowed"),
         ({"settings": {"max_sessions": 0}}, "at '/settings/max_sessions'"),
