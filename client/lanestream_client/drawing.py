@@ -14,7 +14,7 @@ with needs_extra("video"):
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from lanestream_client.frames import BgrImage
+    from lanestream_client.pixels import BgrImage
 
     FloatArray = NDArray[np.float64]
 

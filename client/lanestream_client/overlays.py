@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lanestream.protocol import ErrorMessage, LaneModel, LanesMessage
-    from lanestream_client.frames import BgrImage
+    from lanestream_client.pixels import BgrImage
 
     FloatArray = NDArray[np.float64]
 
