@@ -19,7 +19,7 @@ from lanestream.protocol import (
     error_message,
 )
 from lanestream.road.view import Image
-from lanestream_client.drawing import ALERT, CAUTION, WHITE, position_color
+from lanestream_client.colors import ALERT, CAUTION, WHITE, position_color
 from lanestream_client.line_styles import line_name
 from lanestream_client.overlays import draw_error, draw_lanes
 
