@@ -6,6 +6,7 @@ The program that mounts them passes the function that loads an engine of this pr
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
@@ -190,7 +191,9 @@ def detect(
 )
 @click.option("--video", type=click.Path(path_type=Path), help="Write a video with lanes to this MP4 file.")
 @click.option(
-    "--show", is_flag=True, help="Show the newest frame with lanes in a browser, at an address that is printed."
+    "--show",
+    is_flag=True,
+    help="Show the newest frame with lanes in a browser on this machine, at an address that is printed.",
 )
 @click.option(
     "--fps",
@@ -385,7 +388,8 @@ def _announce(shown: Preview) -> None:
     """Prints where the preview is, and opens it if this machine has a display."""
     click.echo(f"preview: {shown.url}", err=True)
     if has_display():
-        click.launch(shown.url)
+        # Some systems return from this only when the browser is closed.
+        threading.Thread(target=partial(click.launch, shown.url, wait=True), name="browser", daemon=True).start()
 
 
 @contextmanager

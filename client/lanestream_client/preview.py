@@ -43,7 +43,7 @@ _PAGE: Final = b"""<!doctype html>
 <title>Lanestream preview</title>
 <style>
 html, body { margin: 0; height: 100%; background: #14181c }
-img { width: 100%; height: 100%; object-fit: contain }
+img { display: block; width: 100%; height: 100%; object-fit: contain }
 </style>
 <img src="/frames" alt="Newest frame with its lanes">
 </html>
@@ -82,8 +82,9 @@ class Preview:
 
     def close(self) -> None:
         """Disconnects all viewers. Browsers keep showing the last frame."""
-        self._loop.call_soon_threadsafe(self._closed.set)
-        self._thread.join()
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._closed.set)
+            self._thread.join()
 
     async def _serve(self, started: Future[int]) -> None:
         self._loop = asyncio.get_running_loop()
@@ -135,7 +136,7 @@ class Preview:
         elif status is HTTPStatus.OK:
             await _send(writer, _head(status, "text/html; charset=utf-8") + _PAGE)
         else:
-            await _send(writer, _head(status, "text/plain") + f"{status.description or status.phrase}\n".encode())
+            await _send(writer, _head(status, "text/plain; charset=utf-8") + f"{status.phrase}\n".encode())
 
     def _check(self, head: bytes) -> tuple[HTTPStatus, str]:
         """Returns the status of the response to a request, and the requested path."""
