@@ -121,6 +121,8 @@ class Preview:
                 writer.close()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # the peer left, or was too slow
+        except asyncio.CancelledError:
+            pass  # the preview was closed; Python 3.11 would print a traceback for a canceled task
         finally:
             self._connections -= 1
             if not writer.is_closing():

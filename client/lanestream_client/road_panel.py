@@ -179,17 +179,16 @@ def _draw_map(drawing: Drawing, lanes: list[LaneModel]) -> None:
     """Draws boundaries from above, ahead is up, with their uncertainty as bands; fills the image."""
     height, width = drawing.image.shape[:2]
     for distance in _GRID_M:
-        drawing.line(
-            _map_points(np.array([distance] * 2), np.array([-_SIDE_M, _SIDE_M]), width, height), (80, 76, 72), 1.0
-        )
-        if distance in _GRID_M[1::2]:
-            (at,) = _map_points(np.array([distance]), np.array([_SIDE_M]), width, height)
-            inset = 3.0 * drawing.text_scale
-            drawing.text(f"{distance:.0f} m", (at[0] + inset, at[1] - inset), GRAY, 0.4)
+        across = _map_points(np.array([distance] * 2), np.array([-_SIDE_M, _SIDE_M]), width, height)
+        drawing.line(across, (80, 76, 72), 1.0)
     for lane in lanes:
         _draw_band(drawing, lane)
     for lane in lanes:
         _draw_line(drawing, lane)
+    inset = 3.0 * drawing.text_scale
+    for distance in _GRID_M[1::2]:
+        (at,) = _map_points(np.array([distance]), np.array([_SIDE_M]), width, height)
+        drawing.text(f"{distance:.0f} m", (at[0] + inset, at[1] - inset), GRAY, 0.4)
     length, breadth = _VEHICLE_M
     corners = np.array([[-length, breadth], [0.0, breadth], [0.0, -breadth], [-length, -breadth]]) / np.array(
         [1.0, 2.0]

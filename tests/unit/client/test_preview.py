@@ -183,7 +183,7 @@ def test_a_viewer_that_does_not_read_is_dropped_and_delays_nobody(
         assert len(rawclient.read_all(asleep)) < 4_000_000
 
 
-def test_closing_ends_all_viewers_and_frees_the_port() -> None:
+def test_closing_ends_all_viewers_and_frees_the_port(caplog: pytest.LogCaptureFixture) -> None:
     with preview(True) as opened:
         assert opened is not None
         url = opened.url
@@ -192,6 +192,7 @@ def test_closing_ends_all_viewers_and_frees_the_port() -> None:
             next_picture(frames)
             opened.close()
             assert frames.read() in (b"", b"--frame\r\n")
+    assert not caplog.records, "nothing is logged as an error"
     with socket.socket() as port:
         port.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         port.bind(("127.0.0.1", urlsplit(url).port))
