@@ -1,6 +1,7 @@
 """Where the results of a command go: lines of JSON, video files, and the report at the end.
 
-To add a sink, write a class with the method of `ResultSink` here and add its option in commands.py.
+To add a sink, write a class with the method of `ResultSink`, here or in its own module, and add its option in
+commands.py.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ import threading
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import fakes
 import numpy as np
@@ -32,6 +33,7 @@ from lanestream.road.view import Image
 from lanestream_client import AsyncLaneClient, LaneClient, SourceFrame, StreamResult
 from lanestream_client.in_process import InProcessClient
 from lanestream_client.requests import ServiceInfo
+from lanestream_client.sinks import video_sink
 
 Serve = Callable[..., str]
 PAGE = Path(__file__).parents[2] / "docs" / "client.md"
@@ -414,13 +416,46 @@ def test_the_close_code_of_a_too_large_message_has_its_error() -> None:
         list(client.stream(frames(100), mode="all"))
 
 
+def examples() -> list[str]:
+    """Returns the blocks of Python in docs/client.md."""
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+
+
 def test_the_examples_of_the_client_page_work(
     url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "road.jpg").write_bytes(fakes.image_file())
     monkeypatch.chdir(tmp_path)
-    blocking, asynchronous, _ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    blocking, asynchronous, *_ = examples()
     for code in (blocking, asynchronous):
         exec(code.replace("http://127.0.0.1:8000", url), {})  # noqa: S102
         lines = capsys.readouterr().out.splitlines()
         assert [line.split(" ", 2)[0] for line in lines if line[0].isdigit()] == [str(seq) for seq in range(25)]
+
+
+def test_the_examples_with_arrays_and_other_libraries_work(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "road.jpg").write_bytes(fakes.image_file())
+    monkeypatch.chdir(tmp_path)
+    _, _, arrays, supervision, *_ = (code.replace("http://127.0.0.1:8000", url) for code in examples())
+    names: dict[str, Any] = {}
+    exec(arrays, names)  # noqa: S102
+    assert (tmp_path / "road.lanes.jpg").stat().st_size > 0
+    assert names["picture"].shape == (180, 320, 3)
+    pytest.importorskip("supervision")
+    exec(supervision, names)  # noqa: S102
+    assert (names["picture"] != names["frame"]).any()
+    assert names["zone"].polygon.shape[1] == 2
+
+
+def test_the_example_with_rerun_works(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rerun = pytest.importorskip("rerun")
+    with video_sink(tmp_path / "drive.mp4", 25.0) as sink:
+        assert sink is not None
+        for number in range(5):
+            sink.write(fakes.picture(), number / 25.0)
+    monkeypatch.chdir(tmp_path)
+    (code,) = (code for code in examples() if "rerun.init" in code)
+    monkeypatch.setattr(rerun, "init", lambda name, spawn: None)
+    exec(code.replace("http://127.0.0.1:8000", url), {})  # noqa: S102
