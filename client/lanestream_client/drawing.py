@@ -103,7 +103,7 @@ class Drawing:
         bottom = ceil(at[1] + below / _OVERSAMPLING) + 1
         large = np.zeros(((bottom - top) * _OVERSAMPLING, (right - left) * _OVERSAMPLING), np.uint8)
         origin = round((at[0] - left) * _OVERSAMPLING), round((at[1] - top) * _OVERSAMPLING)
-        cv2.putText(large, text, origin, _FONT, font_scale, 255, thickness, cv2.LINE_AA)
+        cv2.putText(large, text, origin, _FONT, font_scale, 255, thickness, cv2.LINE_8)
         mask = cv2.resize(large, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
         inside = self.image[max(0, top) : max(0, bottom), max(0, left) : max(0, right)]
         rows, columns = max(0, -top), max(0, -left)

@@ -28,7 +28,7 @@ _LABEL_PADDING: Final = 7.0
 _PLACES: Final = (0.3, 0.45, 0.15, 0.6, 0.75)
 # The legend takes at most this share of the height; of the others, the boundaries next to the vehicle come first.
 _MOST_HEIGHT: Final = 0.46
-_LEAST_STRENGTH: Final = 0.55
+_LEAST_STRENGTH: Final = 0.7
 _TITLE, _ENTRY = 0.55, 0.5  # sizes of text
 
 
