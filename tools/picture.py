@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 
 from lanestream.local import LocalEngine
-from lanestream.protocol import CameraModel, LanesMessage
+from lanestream.protocol import CameraModel, LanesMessage, TimingModel
 from lanestream_client.overlays import draw_lanes
 from lanestream_exporter.scenes import Drive, RenderedFrame, render_clip, sample_clip
 
 SEED, WIDTH, HEIGHT, FRAMES, FPS = 4, 1280, 720, 62, 12.5
 SHOWN = 40  # the frame in the picture
+# Times would differ from run to run, and with them the picture.
+NO_TIMES = TimingModel(decode=0, propose=0, queue=0, infer=0, track=0, total=0)
 
 
 def main(out: Path) -> None:
@@ -32,10 +34,9 @@ def tracked_frames(count: int) -> Iterator[tuple[RenderedFrame, LanesMessage]]:
     lens = clip.scene.camera
     model = CameraModel(height=lens.mount_height, field_of_view=lens.field_of_view)
     camera = LocalEngine.load(None, "cpu").open_camera(camera=model)
-    # All are rendered first, so that the times in the picture are those of frames in quick succession.
-    rendered = [frame for frame, _ in zip(render_clip(clip), range(count), strict=False)]
-    for seq, frame in enumerate(rendered):
-        yield frame, camera.lanes(frame.image, seq=seq, timestamp=frame.timestamp)
+    for seq, frame in zip(range(count), render_clip(clip), strict=False):
+        lanes = camera.lanes(frame.image, seq=seq, timestamp=frame.timestamp)
+        yield frame, lanes.model_copy(update={"timing_ms": NO_TIMES})
 
 
 if __name__ == "__main__":

@@ -82,9 +82,10 @@ def _legend_text(drawing: Drawing, lane: LaneModel, room: float) -> str:
     return _first_that_fits(drawing, room, _ENTRY, ", ".join(part for part in parts if part), position)
 
 
-def _titles(message: LanesMessage) -> tuple[str, str]:
-    frame = f"frame {message.seq}"
-    return f"{frame}   {message.timing_ms.total:.1f} ms", frame
+def _titles(message: LanesMessage) -> tuple[str, ...]:
+    """Returns the frame number with the latency, unless it is unknown, and without it."""
+    frame, total_ms = f"frame {message.seq}", message.timing_ms.total
+    return (f"{frame}   {total_ms:.1f} ms", frame) if total_ms else (frame,)
 
 
 def _first_that_fits(drawing: Drawing, room: float, size: float, *texts: str) -> str:

@@ -37,7 +37,7 @@ _TICKS: Final = 12  # along a road edge
 _TICK_LENGTH: Final = 6.0  # in half widths of a line
 _MARGIN: Final = 48.0  # pixels around a boundary that its ribbon and its ticks may cover
 # The opacity of the ego lane at shares of its rows from the farthest to the nearest. It fades with distance, and just
-# in front of the vehicle, where the bonnet may hide the road.
+# in front of the vehicle, where the hood may hide the road.
 _LANE_ROWS: Final = (0.0, 0.35, 0.6, 1.0)
 _LANE_OPACITY: Final = (0.02, 0.28, 0.34, 0.0)
 # The share of the rows of a boundary, from its far end, in which it fades.

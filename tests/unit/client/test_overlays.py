@@ -151,6 +151,13 @@ def test_a_predicted_boundary_is_paler_whatever_it_is(fields: dict[str, object])
     assert brightest[0] + 30 < brightest[1] + 15 < brightest[2]
 
 
+def test_the_legend_has_the_latency_if_it_is_known() -> None:
+    image, message = road(1280, 720)
+    timed = message.model_copy(update={"timing_ms": message.timing_ms.model_copy(update={"total": 12.3})})
+    titles = [draw_lanes(image, each)[13:45, 13:300] for each in (message, timed)]
+    assert with_color(titles[0], WHITE) < 0.7 * with_color(titles[1], WHITE)
+
+
 def test_the_legend_says_what_boundaries_are() -> None:
     _, message = road(320, 180)
     marking, edge = message.lanes
@@ -262,7 +269,7 @@ def test_the_ego_lane_starts_at_the_lowest_points() -> None:
         lanes.append(lane.model_copy(update={"line": line}))
     opacity = green(draw_lanes(image, message.model_copy(update={"lanes": lanes})))
     assert opacity[500, 640] > 10.0
-    assert (opacity[602:, 640] == 0.0).all(), "nothing below, where the vehicle's bonnet may be"
+    assert (opacity[602:, 640] == 0.0).all(), "nothing below, where the vehicle's hood may be"
 
 
 def test_the_ego_lane_goes_on_beside_a_boundary_that_leaves_the_image() -> None:
