@@ -31,8 +31,9 @@ _MAP_HEIGHT: Final = 230.0
 # In narrower images, there is no room beside the legend.
 _LEAST_WIDTH: Final = 480.0
 _LEAST_WIDTH_FOR_MAP: Final = 800.0
-# The readings take at most this share of the height.
+# The readings and the map take at most these shares of the height.
 _MOST_HEIGHT: Final = 0.32
+_MOST_HEIGHT_OF_MAP: Final = 0.6
 # The part of the road that the map shows in meters: ahead, behind and on either side of the vehicle.
 _AHEAD_M: Final = 45.0
 _BEHIND_M: Final = 5.0
@@ -80,7 +81,9 @@ def draw_road_panel(drawing: Drawing, message: LanesMessage) -> list[Box]:
 
 
 def _map_width(drawing: Drawing, message: LanesMessage) -> float:
-    has_room = drawing.image.shape[1] >= _LEAST_WIDTH_FOR_MAP * drawing.text_scale
+    height, width = drawing.image.shape[:2]
+    scale = drawing.text_scale
+    has_room = width >= _LEAST_WIDTH_FOR_MAP * scale and _MAP_HEIGHT * scale <= _MOST_HEIGHT_OF_MAP * height
     known = any(lane.ground is not None for lane in message.lanes)
     return _MAP_WIDTH * drawing.text_scale if known and has_room else 0.0
 
