@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 from lanestream.errors import MissingExtraError, needs_extra, needs_whole_packages
-from lanestream_client.colors import EGO_LANE, Color
 from lanestream_client.ego_lane import columns, ego_lane_outline
 from lanestream_client.line_styles import line_style
 from lanestream_client.pixels import check_pixels
@@ -84,10 +83,10 @@ def log_to_rerun(
 ) -> None:
     """Logs the lanes of one frame to Rerun, below `entity` of `recording`, or of the current recording if None.
 
-    `ENTITY/image` is the frame, BGR (H, W, 3) uint8, as a JPEG, and `ENTITY/image/lanes` and `ENTITY/image/ego_lane`
-    are lines in its pixels. `ENTITY/road/lanes` are lines in meters if the camera is known: x forward, y to the left, z
-    up, with the origin on the road below the camera. The timelines are `frame`, the frame number, and `capture_time`,
-    the timestamp in seconds.
+    `ENTITY/image` is the frame, BGR (H, W, 3) uint8, as a JPEG, and `ENTITY/image/lanes` are lines in its pixels.
+    `ENTITY/road/lanes` are lines in meters if the camera is known: x forward, y to the left, z up, with the origin on
+    the road below the camera. The timelines are `frame`, the frame number, and `capture_time`, the timestamp in
+    seconds. Labels, which the viewer shows on hover, have the track id, the position, the kind and the state.
 
     Raises ImageError if `frame` does not have the size of the image that was sent, and MissingExtraError if the Rerun
     SDK is not installed.
@@ -105,19 +104,14 @@ def log_to_rerun(
     if frame is not None:
         log("image", rerun.Image(frame, color_model="BGR").compress(jpeg_quality=_JPEG_QUALITY))
     # Without lanes, empty ones are logged: otherwise the viewer would go on showing those of an earlier frame.
-    lanes = message.lanes
-    strips = [_resampled(lane) for lane in lanes]
-    radii = rerun.Radius.ui_points(_RADIUS_PX)
-    style: dict[str, Any] = {"colors": [_rgba(lane) for lane in lanes], "labels": [_label(lane) for lane in lanes]}
-    log("image/lanes", rerun.LineStrips2D(strips, radii=radii, **style))
-    outline = ego_lane_polygon(message)
-    closed = [] if outline is None else [np.vstack([outline, outline[:1]])]
-    log("image/ego_lane", rerun.LineStrips2D(closed, radii=radii, colors=[(*_rgb(EGO_LANE), 90)]))
-    in_meters = [lane for lane in lanes if lane.ground is not None]
+    strips = [_resampled(lane) for lane in message.lanes]
+    radius = rerun.Radius.ui_points(_RADIUS_PX)
+    log("image/lanes", rerun.LineStrips2D(strips, radii=radius, **_style(message.lanes)))
+    in_meters = [lane for lane in message.lanes if lane.ground is not None]
     if in_meters or message.departure is not None:
         rerun.log(f"{entity}/road", rerun.ViewCoordinates.FLU, static=True, recording=recording)
-        style = {"colors": [_rgba(lane) for lane in in_meters], "labels": [_label(lane) for lane in in_meters]}
-        log("road/lanes", rerun.LineStrips3D([_on_road(lane) for lane in in_meters], radii=_RADIUS_M, **style))
+        strips = [_on_road(lane) for lane in in_meters]
+        log("road/lanes", rerun.LineStrips3D(strips, radii=_RADIUS_M, **_style(in_meters)))
 
 
 @contextmanager
@@ -145,15 +139,20 @@ def _on_road(lane: LaneModel) -> FloatArray:
     return np.column_stack([x, np.polyval(lane.ground, x), np.zeros_like(x)])
 
 
+def _style(lanes: Sequence[LaneModel]) -> dict[str, Any]:
+    """Returns the colors of lines, and labels that do not cover the image."""
+    return {
+        "colors": [_rgba(lane) for lane in lanes],
+        "labels": [_label(lane) for lane in lanes],
+        "show_labels": False,
+    }
+
+
 def _label(lane: LaneModel) -> str:
     return f"{lane.track_id}: {lane.position:+d}, {lane.kind.replace('_', ' ')}, {lane.state}"
 
 
 def _rgba(lane: LaneModel) -> tuple[int, int, int, int]:
     style = line_style(lane)
-    return (*_rgb(style.color), round(255.0 * style.near_opacity))
-
-
-def _rgb(color: Color) -> tuple[int, int, int]:
-    blue, green, red = color
-    return red, green, blue
+    blue, green, red = style.color
+    return red, green, blue, round(255.0 * style.near_opacity)

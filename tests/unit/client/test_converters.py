@@ -72,7 +72,6 @@ def test_rerun_gets_the_image_and_lines_in_pixels_and_meters(message: LanesMessa
     for part in (
         b"/camera/image",
         b"/camera/image/lanes",
-        b"/camera/image/ego_lane",
         b"/camera/road/lanes",
         b"/rear/image/lanes",
     ):
