@@ -149,7 +149,7 @@ def test_the_command_writes_a_camera_file(tmp_path: Path, boards: list[Image]) -
 
 def test_the_command_adds_the_direction_to_a_camera_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     engine = fakes.engine(detector=YawedDetector(319.5, iter(lambda: True, False)))
-    monkeypatch.setattr(calibration_commands, "load_engine", lambda provider: engine)
+    monkeypatch.setattr("lanestream.engine.load_engine", lambda provider: engine)
     monkeypatch.setattr(calibration_commands, "read_pictures", lambda _: drive(450))
     start, out = tmp_path / "lens.json", tmp_path / "camera.json"
     start.write_text('{"height": 1.2, "field_of_view": 62, "roll": 1}')
