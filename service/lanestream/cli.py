@@ -33,6 +33,9 @@ _EXIT_CAMERA_LOST: Final = 3
 _EXIT_INTERRUPTED: Final = 130
 _EXIT_TERMINATED: Final = 143
 
+# The extra that the commands of this package need when they run.
+_SERVICE_EXTRA: Final = "service,cpu"
+
 # Each entry point of this group is a mapping from a command's name to the fields of a MountedCommand.
 _COMMANDS_GROUP: Final = "lanestream.commands"
 # An entry point of this group is a function that draws a `lanes` message on an image.
@@ -84,9 +87,7 @@ class CommandGroup(click.Group):
             return super().invoke(ctx)
         except ModuleNotFoundError as error:
             mounted = self.mounted.get(ctx.invoked_subcommand or "")
-            if mounted is None:
-                raise
-            raise missing_extra(error, mounted.extra) from None
+            raise missing_extra(error, _SERVICE_EXTRA if mounted is None else mounted.extra) from None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the list of commands for the help."""
@@ -138,13 +139,12 @@ def serve(*, print_config: bool, **options: Any) -> None:
 
     Every setting can also be given as LANESTREAM_<NAME>, or in the file of --config. --print-config lists them all.
     """
-    with needs_extra("service,cpu"):
-        from lanestream.api.server import serve as run
-        from lanestream.engine import load_engine, resolve_regressor
-        from lanestream.settings import load_settings, to_toml
+    from lanestream.api.server import serve as run
+    from lanestream.engine import load_engine, resolve_regressor
+    from lanestream.settings import load_settings, to_toml
 
-        # Last: OpenCV reads its pixel limit when it is first imported, and the service's modules set that limit before.
-        draw_lanes = _load_overlay()
+    # Last: OpenCV reads its pixel limit when it is first imported, and the service's modules set that limit before.
+    draw_lanes = _load_overlay()
     settings = load_settings(**options)
     if print_config:
         click.echo(to_toml(settings))
@@ -185,9 +185,9 @@ def doctor(context: click.Context, /, *, required: str | None, as_json: bool, **
 
     The networks are loaded and timed with the same settings as for `serve`. Suggestions say what would be faster.
     """
-    with needs_extra("service,cpu"):
-        from lanestream.doctor import diagnose, print_diagnosis
-        from lanestream.settings import load_settings
+    from lanestream.doctor import diagnose, print_diagnosis
+    from lanestream.settings import load_settings
+
     diagnosis = diagnose(load_settings(**given), required)
     print_diagnosis(diagnosis, as_json=as_json)
     if diagnosis.problem is not None:
@@ -200,8 +200,8 @@ def doctor(context: click.Context, /, *, required: str | None, as_json: bool, **
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 def models(files: tuple[Path, ...], *, as_json: bool) -> None:
     """Describe model files, by default the shipped ones."""
-    with needs_extra("service,cpu"):
-        from lanestream.model_files import describe_models, print_models
+    from lanestream.model_files import describe_models, print_models
+
     print_models(describe_models(files), as_json=as_json)
 
 
@@ -250,9 +250,10 @@ def _load_local_engine(model: Path | None, provider: str | None, regressor: Path
             ctx=click.get_current_context(),
             param_hint="'--provider'",
         )
-    with needs_extra("service,cpu"):
+    with needs_extra(_SERVICE_EXTRA):
         from lanestream.local import LocalEngine
-    return LocalEngine.load(model, chosen, regressor)
+
+        return LocalEngine.load(model, chosen, regressor)
 
 
 def _load_overlay() -> Callable[..., Any] | None:

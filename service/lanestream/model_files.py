@@ -19,7 +19,7 @@ from lanestream.inference.loading import load_model
 
 _CARD: Final = SHIPPED_MODEL.with_name("MODEL_CARD.md")
 # Without a terminal, lines are this wide, so that paths are not broken.
-_PIPE_WIDTH: Final = 240
+_PIPE_WIDTH: Final = 400
 
 
 @dataclass(frozen=True)

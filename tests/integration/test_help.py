@@ -104,6 +104,16 @@ def test_without_its_extra_a_command_says_what_to_install(arguments: str, extra:
     assert result.stderr.endswith(f", which is not installed (pip install 'lanestream[{extra}]')\n")
 
 
+@pytest.mark.parametrize("arguments", ["models", "doctor", f"detect {__file__}"])
+def test_onnxruntime_may_be_the_only_one_missing(arguments: str) -> None:
+    result = run(RUN, ["onnxruntime"], *arguments.split())
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert (
+        "this needs the package onnxruntime, which is not installed (pip install 'lanestream[service,cpu]')"
+    ) in result.stderr.replace("\n", " ")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
