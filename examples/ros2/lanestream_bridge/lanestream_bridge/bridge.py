@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from lanestream.errors import LanestreamError, SettingsError
@@ -34,7 +34,7 @@ class BridgeSettings:
     """The service and what to ask of it. `camera` is None if unknown, then lanes are in pixels only."""
 
     url: str
-    api_key: str | None = None
+    api_key: str | None = field(default=None, repr=False)
     mode: Mode = "latest"
     detector: DetectorName | None = None
     camera: CameraModel | None = None

@@ -134,7 +134,7 @@ def _camera(values: dict[str, Any]) -> CameraModel:
         return CameraModel.model_validate(values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        name = ".".join(str(part) for part in first["loc"][:1]) or "the camera"
+        name = str(first["loc"][0]) if first["loc"] else "the geometry"
         raise ConversionError(f"{name} of the camera is not accepted: {first['msg']}") from None
 
 
