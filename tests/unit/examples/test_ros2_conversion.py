@@ -238,13 +238,14 @@ def test_the_newest_frames_are_kept() -> None:
     ("status", "expected"),
     [
         (BridgeStatus(), ("WARN", "no image yet")),
-        (BridgeStatus(received=3), ("WARN", "no answer yet")),
+        (BridgeStatus(received=3, received_at=99.9), ("WARN", "no answer yet")),
+        (BridgeStatus(received=3, received_at=90.0, answered_at=90.1), ("WARN", "no image for 10 s")),
         (
-            BridgeStatus(received=3, answered=1, answered_at=99.5, service_ms=20.4),
+            BridgeStatus(received_at=99.9, answered_at=99.5, service_ms=20.4),
             ("OK", "streaming, 20 ms in the service"),
         ),
-        (BridgeStatus(received=3, answered=1, answered_at=90.0), ("WARN", "no answer for 10 s")),
-        (BridgeStatus(received=3, answered_at=99.5, error="refused"), ("ERROR", "refused")),
+        (BridgeStatus(received_at=99.9, answered_at=90.0), ("WARN", "no answer for 10 s")),
+        (BridgeStatus(received_at=99.9, answered_at=99.5, error="refused"), ("ERROR", "refused")),
     ],
 )
 def test_diagnosis(status: BridgeStatus, expected: tuple[str, str]) -> None:

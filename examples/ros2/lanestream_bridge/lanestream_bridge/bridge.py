@@ -25,7 +25,7 @@ Level = Literal["OK", "WARN", "ERROR"]
 _WAITING: Final[dict[Mode, int]] = {"latest": 1, "all": 64}
 # The client reconnects by itself. After it has given up, or was refused, the bridge tries again after this pause.
 _RETRY_PAUSE_S: Final = 5.0
-# Without an answer for this long, the service is slow or the connection is being restored.
+# Without an image or an answer for this long (seconds), something is slow or being restored.
 _LATE_S: Final = 2.0
 
 
@@ -83,14 +83,17 @@ class BridgeStatus:
     failed: int = 0
     reconnects: int = 0
     service_ms: float = 0.0
+    received_at: float | None = None
     answered_at: float | None = None
 
     def diagnosis(self, now: float) -> tuple[Level, str]:
-        """Returns the level and a line of text; `now` and `answered_at` are of time.monotonic, in seconds."""
+        """Returns the level and a line of text; `now` and the other times are of time.monotonic, in seconds."""
         if self.error is not None:
             return "ERROR", self.error
-        if self.received == 0:
+        if self.received_at is None:
             return "WARN", "no image yet"
+        if now - self.received_at > _LATE_S:
+            return "WARN", f"no image for {now - self.received_at:.0f} s"
         if self.answered_at is None:
             return "WARN", "no answer yet"
         if now - self.answered_at > _LATE_S:
@@ -191,6 +194,7 @@ class Bridge:
             self._headers[frame.seq] = message.header
         replaced = self._frames.put(frame)
         self._count(received=1, replaced=int(replaced))
+        self._update(received_at=time.monotonic())
 
     def _run(self) -> None:
         while not self._closed.is_set():
