@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from documentation import table_keys
 
+from lanestream import suggestions as module
 from lanestream.gpu import Gpu
 from lanestream.host import Cpu
 from lanestream.suggestions import Findings, suggestions
@@ -18,6 +21,12 @@ H200 = Gpu(("NVIDIA H200, 143771 MiB",), "580.95", "13.0", "13.0", "13.0", "9.13
 FINE = Findings(VNNI, NO_GPU, ("cpu",), "auto", ("cpu", "cpu"), ("int8", "int8"), None, worker_limit=8)
 ON_GPU = replace(FINE, gpu=H200, installed=("cuda", "cpu"), runs_on=("cuda", "cuda"), precisions=("fp16", "fp16"))
 NOT_ON_GPU = replace(ON_GPU, runs_on=("cpu", "cpu"), skipped="CUDA can't be used: out of memory; it is available")
+
+
+def test_the_page_describes_every_suggestion() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "providers.md").read_text()
+    (table,) = (part for part in page.split("\n\n") if part.startswith("| suggestion | if |"))
+    assert list(table_keys(table)) == [rule.topic for rule in module._RULES]
 
 
 @pytest.mark.parametrize(
