@@ -86,6 +86,8 @@ class CommandGroup(click.Group):
         try:
             return super().invoke(ctx)
         except ModuleNotFoundError as error:
+            if (error.name or "").startswith("lanestream"):
+                raise
             mounted = self.mounted.get(ctx.invoked_subcommand or "")
             raise missing_extra(error, _SERVICE_EXTRA if mounted is None else mounted.extra) from None
 

@@ -1,4 +1,4 @@
-"""The command `models`: what model files say about themselves, as a table or as JSON."""
+"""The command `models`: what model files say about themselves, as text or as JSON."""
 
 from __future__ import annotations
 
@@ -9,17 +9,11 @@ from pathlib import Path
 from typing import Final
 
 import click
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from lanestream.engine import SHIPPED_MODEL, SHIPPED_REGRESSOR
 from lanestream.inference.loading import load_model
 
 _CARD: Final = SHIPPED_MODEL.with_name("MODEL_CARD.md")
-# Without a terminal, lines are this wide, so that paths are not broken.
-_PIPE_WIDTH: Final = 400
 
 
 @dataclass(frozen=True)
@@ -48,23 +42,17 @@ def describe_models(files: Sequence[Path] = ()) -> list[ModelFile]:
 
 
 def print_models(models: Sequence[ModelFile], *, as_json: bool) -> None:
-    """Prints a table, or one JSON document."""
+    """Prints a paragraph for each file, or one JSON document."""
     if as_json:
         click.echo(json.dumps({"models": [asdict(model) for model in models]}, indent=2))
         return
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = _PIPE_WIDTH
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False)
-    for heading in ("model", "kind", "precision", "size", "default of", "file", "sha256"):
-        table.add_column(heading, overflow="fold")
     for model in models:
+        default = "" if model.default is None else f", the default of {model.default}"
         size = f"{model.bytes / 1e6:.1f} MB"
-        cells = f"{model.name} {model.version}", model.kind, model.precision, size, model.default or "", model.file
-        table.add_row(*map(Text, cells), Text(model.sha256))
-    console.print(table)
-    for card in sorted({model.card for model in models if model.card is not None}):
-        click.echo(f"\nmodel card: {card}")
+        click.echo(f"{model.name} {model.version}: {model.kind}, {model.precision}, {size}{default}")
+        click.echo(f"  file    {model.file}\n  sha256  {model.sha256}")
+        if model.card is not None:
+            click.echo(f"  card    {model.card}")
 
 
 def _describe(path: Path, *, is_shipped: bool) -> ModelFile:
