@@ -17,13 +17,13 @@ from lanestream_client import CameraModel, SourceFrame
 if TYPE_CHECKING:
     from lanestream.protocol import LaneModel, LanesMessage
 
-# Channels by encoding, and the order of the first three that makes BGR.
+# Channels by encoding, and those that are BGR, or gray.
 _ENCODINGS: Final = {
-    "bgr8": (3, (0, 1, 2)),
-    "rgb8": (3, (2, 1, 0)),
-    "bgra8": (4, (0, 1, 2)),
-    "rgba8": (4, (2, 1, 0)),
-    "mono8": (1, (0, 0, 0)),
+    "bgr8": (3, slice(0, 3)),
+    "rgb8": (3, slice(None, None, -1)),
+    "bgra8": (4, slice(0, 3)),
+    "rgba8": (4, slice(2, None, -1)),
+    "mono8": (1, slice(0, 1)),
 }
 _FILE_STARTS: Final = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"RIFF")  # JPEG, PNG, WebP
 _DISTORTION_MODEL: Final = "plumb_bob"
@@ -72,7 +72,7 @@ def frame_of_image(message: Any, seq: int) -> SourceFrame:
     if not (height and width) or step < width * channels or len(data) < height * step:
         raise ConversionError(f"{len(data)} bytes are not {height} rows of {width} pixels in steps of {step}")
     rows = data[: height * step].reshape(height, step)[:, : width * channels]
-    pixels = rows.reshape(height, width, channels)[:, :, order]
+    pixels = np.broadcast_to(rows.reshape(height, width, channels)[:, :, order], (height, width, 3))
     return SourceFrame(seq, timestamp_of(message.header.stamp), pixels=np.ascontiguousarray(pixels))
 
 
