@@ -25,7 +25,7 @@ DEV_READY := $(VENV)/.ready-dev
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types page-types demo-clip page-speed page-picture lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types page-types demo-clip page-speed page-picture lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -81,6 +81,10 @@ MODELS := service/lanestream/models
 
 DATA ?= ../shared/data
 
+# The names and the version of the shipped models.
+AS_REGRESSOR := --name lanestream-regressor --version $(VERSION)
+AS_CLASSIFIER := --name lanestream-alexnet --version $(VERSION)
+
 # Trains networks like the shipped ones and writes them to out/. Takes hours on a CPU; continues after an interruption.
 models: export LANESTREAM_DATA = $(DATA)
 models: $(DEV_READY)
@@ -90,11 +94,12 @@ models: $(DEV_READY)
 	$(BIN)/lanestream train classifier --run runs/classifier
 	$(BIN)/lanestream export runs/classifier/best.pt out/classifier-first.onnx --regressor out/regressor-first.onnx
 	$(BIN)/lanestream train regressor regressor-second --run runs/regressor-second --frames runs/regressor/frames
-	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx
+	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx $(AS_REGRESSOR)
 	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx --regressor out/regressor.onnx
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx --precision fp32 \
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx $(AS_CLASSIFIER) \
 	  --regressor out/regressor.onnx
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx $(AS_CLASSIFIER) \
+	  --precision fp32 --regressor out/regressor.onnx
 	$(BIN)/lanestream train checkpoint runs/regressor-second/best.pt out/regressor.pt
 	$(BIN)/lanestream train checkpoint runs/classifier-second/best.pt out/classifier.pt
 
@@ -121,6 +126,10 @@ attack: $(DEV_READY)
 
 asyncapi: $(DEV_READY)
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml
+
+# Updates what the Helm chart repeats: the version, the alerts, and the names and types of settings.
+chart: $(DEV_READY)
+	$(BIN)/python tools/chart.py
 
 # Needs npm: the schema of AsyncAPI documents is published only there.
 asyncapi-check: $(DEV_READY)
@@ -153,6 +162,10 @@ lock: | $(VENV)/bin/python
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
+
+# Fails if a line in it is not a lane boundary of its scene.
+moving-picture: $(DEV_READY)
+	$(BIN)/python tools/moving_picture.py docs/lanes.webp
 
 # Podman's own image format can't store a health check.
 image:
