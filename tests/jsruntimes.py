@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import fakes
+import pytest
 from playwright.sync_api import Page, Route
 
 FOLDER = Path(__file__).parent / "browser"
 LIBRARY = FOLDER.parents[1] / "client/js/dist"
+if not (LIBRARY / "index.js").exists():
+    pytest.fail("client/js is not built: run `make js`", pytrace=False)
 # A scenario processes up to some hundred frames on a machine that may do other things, too.
 RESULT_S = 60.0
 

@@ -11,7 +11,7 @@ import type {
 } from "./messages.js";
 
 /** An image file. It must not be changed before its frame is settled. */
-export type ImageFile = Blob | ArrayBuffer | Uint8Array<ArrayBuffer>;
+export type ImageFile = Blob | ArrayBuffer | Uint8Array;
 
 /** What `start` may hold; see docs/protocol.md. */
 export interface StreamOptions {
