@@ -15,7 +15,8 @@ PAGE_CLIENT = Path(__file__).parents[2] / "service/lanestream/api/static/client"
 
 
 def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["npm", *arguments], cwd=PACKAGE, capture_output=True, text=True, timeout=300)
+    command = ["npm", *arguments]
+    return subprocess.run(command, cwd=PACKAGE, capture_output=True, text=True, timeout=300)
 
 
 def test_the_unit_tests() -> None:

@@ -336,3 +336,12 @@ test("a slow reader of mode latest gets the newest lanes", async (t) => {
   assert.equal((await first).value.seq, 0);
   assert.equal((await iterator.next()).value.seq, 2);
 });
+
+test("a frame with a value that is not valid rejects, and is an event, too", async (t) => {
+  const { stream } = await openStream(t, { mode: "all" });
+  const errors = [];
+  stream.on("error", ({ code, seq, fatal }) => errors.push([code, seq, fatal]));
+  assert.equal((await failure(stream.send(IMAGE, { seq: 4, speed: -1 }))).code, "bad_message");
+  assert.deepEqual(errors, [["bad_message", 4, false]]);
+  assert.deepEqual(sockets[0].sent, ["start"]);
+});
