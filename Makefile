@@ -172,7 +172,7 @@ $(DEV_READY): pyproject.toml | $(VENV)/bin/python
 $(JS_READY): client/js/package-lock.json
 	@command -v npm >/dev/null || { echo "error: no npm (on Debian: apt install nodejs npm)" >&2; exit 1; }
 	@node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)' || { echo "error: Node 20 or later is needed" >&2; exit 1; }
-	cd client/js && npm ci --silent --ignore-scripts || \
+	@cd client/js && npm ci --silent --ignore-scripts || \
 	  { echo "error: the packages of client/js could not be installed: npm ci needs the npm registry" >&2; exit 1; }
 	@touch $@
 

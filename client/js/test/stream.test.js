@@ -345,3 +345,16 @@ test("a frame with a value that is not valid rejects, and is an event, too", asy
   assert.deepEqual(errors, [["bad_message", 4, false]]);
   assert.deepEqual(sockets[0].sent, ["start"]);
 });
+
+test("a stream that has ended can't be restarted", async (t) => {
+  const { stream, advance } = await openStream(t);
+  const ended = stream.end();
+  sockets[0].receive({ type: "summary" });
+  await ended;
+  stream.restart({ horizon: 0.4 });
+  stream.breakConnection();
+  await advance(10);
+  assert.equal(sockets.length, 1);
+  assert.equal(stream.state, "ended");
+  assert.equal((await failure(stream.send(IMAGE))).code, "bad_message");
+});
