@@ -358,3 +358,30 @@ test("a stream that has ended can't be restarted", async (t) => {
   assert.equal(stream.state, "ended");
   assert.equal((await failure(stream.send(IMAGE))).code, "bad_message");
 });
+
+test("an answered frame renews the attempts that come without a pause", async (t) => {
+  const { stream, advance } = await openStream(t, { mode: "all" });
+  for (let seq = 0; seq < 3; seq++) {
+    sockets.at(-1).break();
+    await advance(0);
+    assert.equal(sockets.length, seq + 2);
+    sockets.at(-1).receive(READY);
+    await settle();
+    void stream.send(IMAGE);
+    sockets.at(-1).receive({ type: "lanes", seq });
+    await settle();
+  }
+});
+
+test("connections without an answered frame are opened again with pauses", async (t) => {
+  const { advance } = await openStream(t);
+  sockets[0].break();
+  await advance(0);
+  sockets[1].receive(READY);
+  await settle();
+  sockets[1].break();
+  await advance(0);
+  assert.equal(sockets.length, 2);
+  await advance(0.1);
+  assert.equal(sockets.length, 3);
+});
