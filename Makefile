@@ -25,7 +25,7 @@ DEV_READY := $(VENV)/.ready-dev
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -102,6 +102,10 @@ attack: $(DEV_READY)
 asyncapi: $(DEV_READY)
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml
 
+# Updates what the Helm chart repeats: the version, the alerts, and the names and types of settings.
+chart: $(DEV_READY)
+	$(BIN)/python tools/chart.py
+
 # Needs npm: the schema of AsyncAPI documents is published only there.
 asyncapi-check: $(DEV_READY)
 	npm install --silent --no-audit --no-fund --prefix out/asyncapi @asyncapi/specs@6
@@ -133,6 +137,10 @@ lock: | $(VENV)/bin/python
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
+
+# Fails if a line in it is not a lane boundary of its scene.
+moving-picture: $(DEV_READY)
+	$(BIN)/python tools/moving_picture.py docs/lanes.webp
 
 # Podman's own image format can't store a health check.
 image:
