@@ -25,7 +25,7 @@ DEV_READY := $(VENV)/.ready-dev
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types page-types demo-clip page-speed page-picture lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -57,9 +57,10 @@ js: $(JS_BUILT)
 js-types: $(JS_READY) $(DEV_READY)
 	$(BIN)/python tools/js_types.py
 
+.PHONY: page-types demo-clip page-speed page-picture
+
 # Checks the types in the modules of the live page, against those of the client.
-page-types: $(JS_READY)
-	cd client/js && npm run --silent build
+page-types: $(JS_BUILT)
 	rm -rf out/page-types
 	mkdir -p out/page-types/client
 	cp service/lanestream/api/static/*.js out/page-types
@@ -204,7 +205,8 @@ $(DEV_READY): pyproject.toml | $(VENV)/bin/python
 
 $(JS_READY): client/js/package-lock.json
 	@command -v npm >/dev/null || { echo "error: no npm (on Debian: apt install nodejs npm)" >&2; exit 1; }
-	cd client/js && npm ci --silent --ignore-scripts || \
+	@node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)' || { echo "error: Node 20 or later is needed" >&2; exit 1; }
+	@cd client/js && npm ci --silent --ignore-scripts || \
 	  { echo "error: the packages of client/js could not be installed: npm ci needs the npm registry" >&2; exit 1; }
 	@touch $@
 

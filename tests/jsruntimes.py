@@ -10,12 +10,29 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import fakes
+import pytest
 from playwright.sync_api import Page, Route
 
 FOLDER = Path(__file__).parent / "browser"
 LIBRARY = FOLDER.parents[1] / "client/js/dist"
+if not (LIBRARY / "index.js").exists():
+    pytest.fail("client/js is not built: run `make js`", pytrace=False)
 # A scenario processes up to some hundred frames on a machine that may do other things, too.
 RESULT_S = 60.0
+
+
+def evaluate(page: Page, function: str, argument: Any = None) -> Any:
+    """Returns what a function of JavaScript resolves to, and fails if that takes too long."""
+    page.evaluate(
+        """([source, argument]) => {
+            window.outcome = undefined;
+            const keep = (outcome) => (window.outcome = outcome);
+            Promise.resolve(eval(source)(argument)).then((value) => keep({ value }), (error) => keep({ error }));
+        }""",
+        [f"({function})", argument],
+    )
+    page.wait_for_function("window.outcome", timeout=1000.0 * RESULT_S)
+    return page.evaluate("'error' in outcome ? Promise.reject(outcome.error) : outcome.value")
 
 
 class Scenario(Protocol):
@@ -110,7 +127,7 @@ class PageScenario:
                 const report = (value) => window.reports.push(JSON.stringify(value));
                 const stopped = async () => window.stopped;
                 window.result = scenarios[name]({ lib, frames: binary, report, stopped, ...args });
-                window.result.catch(() => {});
+                window.result.catch(() => {});  // `result` reports it
             }""",
             [name, arguments],
         )
@@ -137,7 +154,7 @@ class PageScenario:
         self._page.evaluate("window.stopped = true")
 
     def result(self) -> Any:
-        return self._page.evaluate("window.result")
+        return evaluate(self._page, "() => window.result")
 
 
 class Chromium:

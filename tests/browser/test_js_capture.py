@@ -15,7 +15,7 @@ from pathlib import Path
 import fakes
 import processes
 import pytest
-from jsruntimes import Chromium
+from jsruntimes import Chromium, evaluate
 from playwright.sync_api import Page, expect
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -27,7 +27,7 @@ def folder_server(folder: Path) -> Iterator[str]:
     """Serves the files of a folder."""
 
     class Handler(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, format: str, *args: object) -> None:
+        def log_request(self, code: object = "-", size: object = "-") -> None:
             pass
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(folder))) as server:
@@ -41,7 +41,7 @@ def folder_server(folder: Path) -> Iterator[str]:
 @pytest.fixture
 def capture_page(page: Page, service: str) -> Page:
     Chromium(page, "[]").open_page(service)
-    page.evaluate("import('/test-page/capture.js').then((module) => Object.assign(window, module))")
+    evaluate(page, "async () => void Object.assign(window, await import('/test-page/capture.js'))")
     return page
 
 
@@ -57,7 +57,7 @@ def capture_page(page: Page, service: str) -> Page:
 def test_captured_frames_have_lanes(
     capture_page: Page, source: str, options: dict[str, float], size: tuple[int, int]
 ) -> None:
-    result = capture_page.evaluate("([name, options]) => capture(name, 12, options)", [source, options])
+    result = evaluate(capture_page, "([name, options]) => capture(name, 12, options)", [source, options])
     answers = result["answers"]
     assert {(answer["width"], answer["height"]) for answer in answers} == {size}
     times = [answer["timestamp"] for answer in answers]
@@ -69,13 +69,14 @@ def test_captured_frames_have_lanes(
 
 
 def test_a_paused_video_sends_nothing(capture_page: Page) -> None:
-    frames = capture_page.evaluate(
+    frames = evaluate(
+        capture_page,
         """async () => {
             video.pause();
             setTimeout(() => video.play(), 500);
             const { answers } = await capture("video", 1);
             return answers.length;
-        }"""
+        }""",
     )
     assert frames == 1
 

@@ -81,6 +81,7 @@ def test_mode_all_answers_every_frame(runtime: Runtime, service: str) -> None:
     assert (result["lastSeq"], result["state"], result["errors"]) == (29, "ended", [])
 
 
+@pytest.mark.parametrize("runtime", ["node"], indirect=True)
 def test_credits_are_respected(runtime: Runtime) -> None:
     with processes.service(credits=1) as (_, url):
         result = runtime.start("streamAll", url, count=20).result()
@@ -127,7 +128,7 @@ def test_200_frames_over_a_connection_that_breaks_three_times(runtime: Runtime, 
     assert len(set.intersection(*track_ids(outcomes)[5:])) >= 2
 
 
-@pytest.mark.parametrize("mode", ["all", "latest"])
+@pytest.mark.parametrize(("runtime", "mode"), [("node", "all"), ("chromium", "latest")], indirect=["runtime"])
 def test_a_killed_service_that_comes_back_has_a_new_session(
     runtime: Runtime, console_errors: list[str], mode: str
 ) -> None:
@@ -150,7 +151,11 @@ def test_a_killed_service_that_comes_back_has_a_new_session(
     console_errors.clear()  # Chromium logs each handshake that fails
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("runtime", "how"),
+    [("node", signal.SIGTERM), ("chromium", signal.SIGTERM), ("chromium", signal.SIGKILL)],
+    indirect=["runtime"],
+)
 def test_track_ids_survive_the_end_of_a_replica(
     runtime: Runtime, tmp_path: Path, console_errors: list[str], how: signal.Signals
 ) -> None:

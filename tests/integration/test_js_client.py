@@ -15,7 +15,8 @@ PAGE_CLIENT = Path(__file__).parents[2] / "service/lanestream/api/static/client"
 
 
 def npm(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["npm", *arguments], cwd=PACKAGE, capture_output=True, text=True, timeout=300)
+    command = ["npm", *arguments]
+    return subprocess.run(command, cwd=PACKAGE, capture_output=True, text=True, timeout=300)
 
 
 def test_the_unit_tests() -> None:
@@ -50,3 +51,9 @@ def test_the_package_holds_what_users_need_and_nothing_else(tmp_path: Path) -> N
     assert "dependencies" not in json.loads((PACKAGE / "package.json").read_text())
     # Addresses of one registry would be of no use with another one.
     assert '"resolved"' not in (PACKAGE / "package-lock.json").read_text()
+
+
+def test_the_types_for_users() -> None:
+    options = ["--noEmit", "--strict", "--module", "nodenext", "--target", "es2022", "--types", "", "--ignoreConfig"]
+    check = npm("exec", "--offline", "--", "tsc", *options, "test/types.ts")
+    assert check.returncode == 0, check.stdout

@@ -54,7 +54,7 @@ export class LaneClient {
   async detect(image: ImageFile, options: DetectOptions = {}): Promise<LanesMessage> {
     const query = detectQuery(options);
     const path = query.size ? `/v1/detect?${query}` : "/v1/detect";
-    return this.#request(path, { method: "POST", body: image });
+    return this.#request(path, { method: "POST", body: image as BodyInit });
   }
 
   /** Returns the loaded networks. The first one belongs to the default detector. */

@@ -17,7 +17,7 @@ const CLOSE_CODES: Readonly<Record<number, string>> = {
   4003: "session_too_old",
 };
 
-export type Message = string | Blob | ArrayBuffer | Uint8Array<ArrayBuffer>;
+export type Message = string | Blob | ArrayBuffer | Uint8Array;
 
 /** The implementations of the standard interfaces that a client uses. */
 export interface Platform {
@@ -76,7 +76,7 @@ export class Connection {
   }
 
   send(message: Message): void {
-    this.#socket.send(message);
+    this.#socket.send(message as string | Blob | BufferSource);
   }
 
   /** Returns the next message. Throws LaneError when the connection is lost. */

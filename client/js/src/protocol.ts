@@ -11,7 +11,7 @@ import type {
 } from "./messages.js";
 
 /** An image file. It must not be changed before its frame is settled. */
-export type ImageFile = Blob | ArrayBuffer | Uint8Array<ArrayBuffer>;
+export type ImageFile = Blob | ArrayBuffer | Uint8Array;
 
 /** What `start` may hold; see docs/protocol.md. */
 export interface StreamOptions {
@@ -258,6 +258,9 @@ export class StreamProtocol {
 
   /** Handles the loss of the socket. The stream has finished if no more frames follow and every frame has its outcome. */
   connectionLost(): void {
+    if (this.state === State.Finished) {
+      return;
+    }
     this.state = State.Disconnected;
     if (this.mode === "latest") {
       for (const frame of this.#frames("sent")) {

@@ -112,8 +112,7 @@ export class LaneStream extends Emitter<StreamEvents> {
       if (this.#failure !== null) {
         throw this.#failure;
       }
-      const seq = this.#protocol.add(image, meta);
-      this.#pending.set(seq, { resolve, reject });
+      this.#pending.set(this.#add(image, meta), { resolve, reject });
       this.#update();
     });
     result.catch(() => {});
@@ -256,6 +255,15 @@ export class LaneStream extends Emitter<StreamEvents> {
   get #canSend(): boolean {
     // In mode `all`, credits bound what waits in the socket.
     return this.#connection !== null && (this.#protocol.mode === "all" || this.#connection.bufferedAmount === 0);
+  }
+
+  #add(image: ImageFile, meta: FrameMeta): number {
+    try {
+      return this.#protocol.add(image, meta);
+    } catch (error) {
+      this.emit("error", LaneError.from(error));
+      throw error;
+    }
   }
 
   /** Sends what can be sent now, and reports the outcomes of frames. */

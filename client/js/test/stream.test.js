@@ -336,3 +336,52 @@ test("a slow reader of mode latest gets the newest lanes", async (t) => {
   assert.equal((await first).value.seq, 0);
   assert.equal((await iterator.next()).value.seq, 2);
 });
+
+test("a frame with a value that is not valid rejects, and is an event, too", async (t) => {
+  const { stream } = await openStream(t, { mode: "all" });
+  const errors = [];
+  stream.on("error", ({ code, seq, fatal }) => errors.push([code, seq, fatal]));
+  assert.equal((await failure(stream.send(IMAGE, { seq: 4, speed: -1 }))).code, "bad_message");
+  assert.deepEqual(errors, [["bad_message", 4, false]]);
+  assert.deepEqual(sockets[0].sent, ["start"]);
+});
+
+test("a stream that has ended can't be restarted", async (t) => {
+  const { stream, advance } = await openStream(t);
+  const ended = stream.end();
+  sockets[0].receive({ type: "summary" });
+  await ended;
+  stream.restart({ horizon: 0.4 });
+  stream.breakConnection();
+  await advance(10);
+  assert.equal(sockets.length, 1);
+  assert.equal(stream.state, "ended");
+  assert.equal((await failure(stream.send(IMAGE))).code, "bad_message");
+});
+
+test("an answered frame renews the attempts that come without a pause", async (t) => {
+  const { stream, advance } = await openStream(t, { mode: "all" });
+  for (let seq = 0; seq < 3; seq++) {
+    sockets.at(-1).break();
+    await advance(0);
+    assert.equal(sockets.length, seq + 2);
+    sockets.at(-1).receive(READY);
+    await settle();
+    void stream.send(IMAGE);
+    sockets.at(-1).receive({ type: "lanes", seq });
+    await settle();
+  }
+});
+
+test("connections without an answered frame are opened again with pauses", async (t) => {
+  const { advance } = await openStream(t);
+  sockets[0].break();
+  await advance(0);
+  sockets[1].receive(READY);
+  await settle();
+  sockets[1].break();
+  await advance(0);
+  assert.equal(sockets.length, 2);
+  await advance(0.1);
+  assert.equal(sockets.length, 3);
+});

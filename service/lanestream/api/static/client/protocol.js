@@ -180,6 +180,9 @@ export class StreamProtocol {
     }
     /** Handles the loss of the socket. The stream has finished if no more frames follow and every frame has its outcome. */
     connectionLost() {
+        if (this.state === State.Finished) {
+            return;
+        }
         this.state = State.Disconnected;
         if (this.mode === "latest") {
             for (const frame of this.#frames("sent")) {

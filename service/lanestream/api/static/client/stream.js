@@ -65,8 +65,7 @@ export class LaneStream extends Emitter {
             if (this.#failure !== null) {
                 throw this.#failure;
             }
-            const seq = this.#protocol.add(image, meta);
-            this.#pending.set(seq, { resolve, reject });
+            this.#pending.set(this.#add(image, meta), { resolve, reject });
             this.#update();
         });
         result.catch(() => { });
@@ -205,6 +204,15 @@ export class LaneStream extends Emitter {
     get #canSend() {
         // In mode `all`, credits bound what waits in the socket.
         return this.#connection !== null && (this.#protocol.mode === "all" || this.#connection.bufferedAmount === 0);
+    }
+    #add(image, meta) {
+        try {
+            return this.#protocol.add(image, meta);
+        }
+        catch (error) {
+            this.emit("error", LaneError.from(error));
+            throw error;
+        }
     }
     /** Sends what can be sent now, and reports the outcomes of frames. */
     #update() {
