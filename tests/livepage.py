@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import cv2
@@ -14,13 +15,15 @@ from playwright.sync_api import Page, Request
 # Far longer than anything takes, so that a test fails instead of hanging.
 WAIT_S = 60.0
 _POLL_MS = 50
+_NOWHERE = "about:blank"
 
 
 class LivePage:
-    """Wraps a browser's page, and notes the addresses that it requests."""
+    """Wraps a browser's page, and notes the addresses that it requests. Its last look is saved as `screenshot`."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: Page, screenshot: Path) -> None:
         self.page = page
+        self._screenshot = screenshot
         self.requests: list[str] = []
         self._hosts: set[str] = set()
         page.on("request", self._note)
@@ -31,8 +34,10 @@ class LivePage:
         self.page.goto(f"{url}/{settings}")
 
     def leave(self) -> None:
-        """Leaves the page, so that it does not notice that its service stops."""
-        self.page.goto("about:blank")
+        """Saves the screenshot and leaves the page, so that it does not notice that its service stops."""
+        if self.page.url != _NOWHERE:
+            self.page.screenshot(path=self._screenshot)
+            self.page.goto(_NOWHERE)
 
     def attribute(self, name: str) -> str:
         """Returns an attribute of the page's state, `source`, `state`, `session`, `drawn` and others; "" if missing."""

@@ -27,6 +27,7 @@ from lanestream.keys import new_key
 from lanestream.protocol import LanesMessage
 
 FPS = 25
+SCREENSHOTS = Path(__file__).parents[2] / "out/screenshots"
 # The palette of Okabe and Ito, in BGR.
 ORANGE, SKY_BLUE = (0, 159, 230), (233, 180, 86)
 BITS, BIT_SIZE = 9, 20
@@ -34,10 +35,11 @@ REGRESSION = "#detector=regression"
 
 
 @pytest.fixture
-def live(page: Page) -> Iterator[LivePage]:
+def live(page: Page, request: pytest.FixtureRequest) -> Iterator[LivePage]:
     """Returns the page in a new tab. Fails if it requested anything from another host."""
-    live = LivePage(page)
+    live = LivePage(page, SCREENSHOTS / f"{re.sub(r'\W+', '-', request.node.name).strip('-')}.png")
     yield live
+    live.leave()
     assert live.foreign_requests() == []
 
 
@@ -180,7 +182,7 @@ def test_a_camera_streams(live: LivePage, service: str) -> None:
 def test_a_screen_streams_until_it_is_not_shared_any_more(live: LivePage, service: str) -> None:
     # A headless Chromium has no screen: its camera stands in for one.
     live.page.add_init_script(
-        """navigator.mediaDevices.getDisplayMedia = async () => {
+        """if (navigator.mediaDevices) navigator.mediaDevices.getDisplayMedia = async () => {
             window.shared = await navigator.mediaDevices.getUserMedia({ video: true });
             return window.shared;
         }"""
@@ -221,7 +223,9 @@ def test_a_file_that_is_not_a_video_is_explained(
 
 def test_a_refused_camera_is_explained(live: LivePage, service: str) -> None:
     live.page.add_init_script(
-        "navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('no', 'NotAllowedError'); }"
+        """if (navigator.mediaDevices) navigator.mediaDevices.getUserMedia = async () => {
+            throw new DOMException("no", "NotAllowedError");
+        }"""
     )
     live.open(service)
     live.page.keyboard.press("c")
