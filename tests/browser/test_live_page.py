@@ -37,7 +37,8 @@ REGRESSION = "#detector=regression"
 @pytest.fixture
 def live(page: Page, request: pytest.FixtureRequest) -> Iterator[LivePage]:
     """Returns the page in a new tab. Fails if it requested anything from another host."""
-    live = LivePage(page, SCREENSHOTS / f"{re.sub(r'\W+', '-', request.node.name).strip('-')}.png")
+    name = re.sub(r"\W+", "-", request.node.name).strip("-")
+    live = LivePage(page, SCREENSHOTS / f"{name}.png")
     yield live
     live.leave()
     assert live.foreign_requests() == []
