@@ -47,7 +47,7 @@ class FrameEncoder {
   #hasRoom = false;
   #isPaused = false;
   #isBusy = false;
-  #lastStart = -Infinity;
+  #lastCaptured = -Infinity;
   #seq = 0;
   #view = new Surface(false);
   #sent = new Surface(true);
@@ -67,7 +67,7 @@ class FrameEncoder {
 
   #isReady() {
     // Half a tick of slack, so that a camera at the very pace of the plan does not lose every other frame.
-    const isDue = now() - this.#lastStart >= this.#plan.intervalMs - TICK_MS / 2;
+    const isDue = now() - this.#lastCaptured >= this.#plan.intervalMs - TICK_MS / 2;
     return this.#hasRoom && !this.#isPaused && !this.#isBusy && isDue;
   }
 
@@ -101,7 +101,7 @@ class FrameEncoder {
     }
     this.#isBusy = true;
     const started = now();
-    this.#lastStart = started;
+    this.#lastCaptured = captured;
     try {
       const [width, height] =
         "displayWidth" in source ? [source.displayWidth, source.displayHeight] : [source.width, source.height];
