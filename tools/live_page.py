@@ -29,7 +29,7 @@ WATCH = """() => {
 WARM_UP_S = 5.0
 DRAWN_S = 30.0
 # Seconds into the clip for the picture.
-PICTURE_AT_S = 3.0
+PICTURE_AT_S = 6.0
 MOST_PICTURE_BYTES = 300_000
 
 

@@ -90,7 +90,7 @@ class LivePage {
     await this.stop();
     this.#notices.clearProblem();
     const capture = new Capture(kind, {
-      onFrame: (frame) => this.#session?.send(frame),
+      onFrame: (frame) => (this.#session ? this.#session.send(frame) : frame.picture.close()),
       onEnd: (problem) => void this.#ended(capture, problem),
     });
     this.#capture = capture;
