@@ -21,8 +21,11 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 # Marks what the environment was set up for. It is set up again when pyproject.toml changes.
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
+# The same for the packages of the JavaScript client; and its first compiled module.
+JS_READY := client/js/node_modules/.ready
+JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -33,7 +36,7 @@ serve: $(RUN_READY)
 train-toy: $(DEV_READY)
 	$(BIN)/python tools/train_toy.py
 
-test: $(DEV_READY)
+test: $(DEV_READY) $(JS_BUILT)
 	$(BIN)/python -m pytest
 
 lint: $(DEV_READY)
@@ -41,6 +44,18 @@ lint: $(DEV_READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Builds the client for browsers and Node. Its modules for the live page are in the repository.
+PAGE_CLIENT := service/lanestream/api/static/client
+
+js: $(JS_BUILT)
+	rm -rf $(PAGE_CLIENT)
+	mkdir -p $(PAGE_CLIENT)
+	cp client/js/dist/*.js $(PAGE_CLIENT)
+
+# Its types of messages, from the service's JSON Schemas.
+js-types: $(JS_READY) $(DEV_READY)
+	$(BIN)/python tools/js_types.py
 
 MODELS := service/lanestream/models
 
@@ -152,7 +167,7 @@ down:
 	$(COMPOSE) down
 
 clean:
-	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) client/js/node_modules client/js/dist out .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(VENV)/bin/python:
 	@"$(PYTHON)" $(NEW_ENOUGH) 2>/dev/null || \
@@ -166,3 +181,14 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,dev]'
 	@touch $@ $(RUN_READY)
+
+$(JS_READY): client/js/package-lock.json
+	@command -v npm >/dev/null || { echo "error: no npm (on Debian: apt install nodejs npm)" >&2; exit 1; }
+	@node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)' || { echo "error: Node 20 or later is needed" >&2; exit 1; }
+	@cd client/js && npm ci --silent --ignore-scripts || \
+	  { echo "error: the packages of client/js could not be installed: npm ci needs the npm registry" >&2; exit 1; }
+	@touch $@
+
+$(JS_BUILT): $(JS_READY) client/js/tsconfig.json $(wildcard client/js/src/*.ts)
+	cd client/js && rm -rf dist && npm run --silent build
+	@touch $@

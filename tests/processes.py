@@ -11,10 +11,13 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def service(**settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Runs a service in a separate process and yields the process and its URL once it is ready."""
+def service(port: int = 0, **settings: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Runs a service in a separate process and yields the process and its URL once it is ready.
+
+    It listens on `port`, by default a free one.
+    """
     environment = {f"LANESTREAM_{name.upper()}": str(value) for name, value in settings.items()}
-    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu"]
+    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", str(port), "--provider", "cpu"]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env={**os.environ, **environment}
     ) as process:

@@ -1,0 +1,551 @@
+// The messages of the service, generated from their JSON Schemas by `make js-types`. Do not edit.
+
+/**
+ * The messages of a stream by who sends them, and the bodies of other responses.
+ */
+export interface Messages {
+  client: StartMessage | FrameMessage | EndMessage;
+  server: ReadyMessage | LanesMessage | WarningMessage | ErrorMessage | DrainingMessage | SummaryMessage;
+  models: ModelList;
+  problem: Problem;
+}
+/**
+ * Client: opens the stream. Without it, the first image opens the stream with the defaults.
+ *
+ * With the token of a session that still exists, the stream continues that session on another socket or another
+ * replica of the service: the same boundaries keep their ids. With an unknown token, a new session starts.
+ */
+export interface StartMessage {
+  type?: "start";
+  /**
+   * Name of the session in logs and in `ready`; generated if missing.
+   */
+  session?: string | null;
+  /**
+   * The token of `ready` or `draining` of the session to resume.
+   */
+  resume_token?: string | null;
+  mode?: "latest" | "all";
+  /**
+   * The detector that finds the lanes; the service's default if missing.
+   */
+  detector?: ("candidates" | "regression") | null;
+  /**
+   * Row of the horizon as a fraction of the image height, negative above the image; estimated if missing.
+   */
+  horizon?: number | null;
+  /**
+   * If present, lanes are also reported in meters.
+   */
+  camera?: CameraModel | null;
+  /**
+   * When to warn of lane departures; the service's settings if missing.
+   */
+  departure?: DepartureOptions | null;
+  /**
+   * The kinds of boundaries to report: `marking`, `road_edge` or both; the service's setting if missing.
+   */
+  kinds?: ["marking" | "road_edge", ...("marking" | "road_edge")[]] | null;
+}
+/**
+ * The camera parameters that coordinates in meters need, over a flat road.
+ *
+ * A camera file holds this object as JSON. Either `field_of_view` or `focal_length` is required. With `auto`, pitch or
+ * yaw are estimated while driving; without a pitch, that of each frame follows from its horizon.
+ */
+export interface CameraModel {
+  /**
+   * Height of the camera above the road in meters.
+   */
+  height: number;
+  field_of_view?: number | null;
+  /**
+   * [fx, fy] in pixels of an image of `image_size`.
+   */
+  focal_length?: [number, number] | null;
+  /**
+   * [cx, cy] in pixels of an image of `image_size`; its middle if missing.
+   */
+  principal_point?: [number, number] | null;
+  /**
+   * [width, height] of the images that were calibrated; that of the frames if missing.
+   */
+  image_size?: [number, number] | null;
+  /**
+   * OpenCV's [k1, k2, p1, p2, k3].
+   *
+   * @minItems 5
+   * @maxItems 5
+   */
+  distortion?: [number, number, number, number, number];
+  /**
+   * Degrees that the camera looks down, or `auto`.
+   */
+  pitch?: number | "auto" | null;
+  /**
+   * Degrees that the camera looks to the left of the vehicle's direction, or `auto`.
+   */
+  yaw?: number | "auto";
+  /**
+   * Degrees that the camera is turned clockwise, as the driver sees it.
+   */
+  roll?: number;
+  /**
+   * Meters that the camera is left of the vehicle's middle.
+   */
+  lateral?: number;
+}
+/**
+ * When to warn of lane departures, which needs a camera. The service's settings apply to missing fields.
+ */
+export interface DepartureOptions {
+  /**
+   * Width of the vehicle over the outer edges of its wheels in meters.
+   */
+  vehicle_width?: number | null;
+  /**
+   * Seconds before a line is crossed in which a warning comes.
+   */
+  warning_s?: number | null;
+  /**
+   * Below this speed in m/s no warning comes, if frames report the speed.
+   */
+  least_speed?: number | null;
+}
+/**
+ * Client: number, capture time and motion for the binary message that follows.
+ *
+ * The service assigns a missing number and a missing time.
+ */
+export interface FrameMessage {
+  type?: "frame";
+  seq?: number | null;
+  /**
+   * Capture time in seconds, on any clock that does not run backwards.
+   */
+  timestamp?: number | null;
+  /**
+   * Speed of the vehicle in m/s.
+   */
+  speed?: number | null;
+  /**
+   * Direction indicator of the vehicle.
+   */
+  indicator?: ("off" | "left" | "right") | null;
+}
+/**
+ * Client: no more frames follow. The service answers the frames it holds, sends a summary and closes the socket.
+ */
+export interface EndMessage {
+  type?: "end";
+}
+/**
+ * Service: the stream is open. `last_seq` is the last answered frame of a resumed session.
+ */
+export interface ReadyMessage {
+  type: "ready";
+  session: string;
+  /**
+   * Resumes this session; keep it as secret as an API key.
+   */
+  resume_token: string;
+  /**
+   * Whether an earlier session continues; false for a new one.
+   */
+  resumed: boolean;
+  last_seq: number | null;
+  mode: "latest" | "all";
+  detector: string;
+  model: string;
+  provider: string;
+  limits: Limits;
+}
+/**
+ * The limits of the service.
+ */
+export interface Limits {
+  /**
+   * Maximum size of an image file in bytes.
+   */
+  max_bytes: number;
+  /**
+   * Maximum number of pixels of an image.
+   */
+  max_pixels: number;
+  /**
+   * Maximum number of unanswered frames in mode `all`.
+   */
+  credits: number;
+  /**
+   * Maximum average number of frames per second.
+   */
+  frames_per_s: number;
+  /**
+   * Maximum average number of bytes per second.
+   */
+  bytes_per_s: number;
+  /**
+   * A stream that is idle for this many seconds is closed.
+   */
+  idle_s: number;
+  /**
+   * Maximum age of a session in seconds.
+   */
+  session_s: number;
+  /**
+   * A session can be resumed for this many seconds after its socket closed.
+   */
+  resume_s: number;
+}
+/**
+ * Service: the lanes of one frame.
+ */
+export interface LanesMessage {
+  type: "lanes";
+  seq: number;
+  timestamp: number;
+  width: number;
+  height: number;
+  horizon: number;
+  lanes: LaneModel[];
+  ego: EgoModel;
+  /**
+   * Null without a camera.
+   */
+  departure: DepartureModel | null;
+  /**
+   * Null unless the camera's pitch or yaw is `auto`.
+   */
+  calibration: CalibrationModel | null;
+  /**
+   * What happened since the previous frame.
+   */
+  events: (LaneChangeModel | DepartureEventModel | SceneCutModel | CalibrationChangedModel)[];
+  /**
+   * Frames of this stream that were dropped so far.
+   */
+  dropped: number;
+  timing_ms: TimingModel;
+}
+/**
+ * A tracked lane boundary: x(y) = v + b u + k / u with u = y - horizon and `coefficients` [v, b, k].
+ *
+ * The curve is valid between the rows of `line`. On a flat road it is a parabola on the ground, seen in perspective.
+ */
+export interface LaneModel {
+  track_id: number;
+  /**
+   * -1 is ego left, +1 ego right, -2 and +2 are the next boundaries outwards.
+   */
+  position: number;
+  /**
+   * `detected` in this frame, `inferred` from the road where little or no paint was seen, or `predicted` only.
+   */
+  state: "detected" | "inferred" | "predicted";
+  probability: number;
+  /**
+   * A `marking` on the road, or a `road_edge`: a curb, or where the pavement ends.
+   */
+  kind: "marking" | "road_edge";
+  /**
+   * Probability that it is of this kind.
+   */
+  kind_probability: number;
+  /**
+   * Null for a road edge, and if the model does not classify markings.
+   */
+  marking: MarkingModel | null;
+  /**
+   * Points on the curve, from the lowest row to the highest.
+   */
+  points: [number, number][];
+  line: LineModel;
+  horizon: number;
+  /**
+   * @minItems 3
+   * @maxItems 3
+   */
+  coefficients: [number, number, number];
+  /**
+   * 3 x 3 covariance of the coefficients.
+   */
+  covariance: number[][];
+  age_s: number;
+  /**
+   * [a, b, c] of Y = a X^2 + b X + c on the road, in meters: X forward of the camera, Y left of the vehicle's middle. Null without a camera.
+   */
+  ground: [number, number, number] | null;
+  /**
+   * 3 x 3 covariance of [a, b, c]. Null without a camera.
+   */
+  ground_covariance: number[][] | null;
+}
+/**
+ * How a marking is painted, as all frames in which it was detected have shown so far.
+ */
+export interface MarkingModel {
+  /**
+   * The most probable type; `dots` are raised dots.
+   */
+  type: "solid" | "dashed" | "double" | "dots";
+  type_probability: number;
+  /**
+   * The more probable color.
+   */
+  color: "white" | "yellow";
+  color_probability: number;
+  /**
+   * Probability that type and color are both right.
+   */
+  probability: number;
+}
+/**
+ * The end points of a boundary: a straight line would join its lowest and its highest row.
+ */
+export interface LineModel {
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  bottom: [number, number];
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  top: [number, number];
+}
+/**
+ * The lane the camera is in: the track ids and kinds of its boundaries, and the camera's offset from the center.
+ *
+ * `offset` is a fraction of the lane width, positive to the right; null unless both boundaries are known. The fields
+ * in meters need a camera model and apply at the vehicle's middle: `offset_m` and `lane_width_m` if both boundaries
+ * are known, `heading` and `curvature` if at least one is. Each has its standard deviation in `..._sigma`.
+ */
+export interface EgoModel {
+  left: number | null;
+  right: number | null;
+  /**
+   * Kind of the left boundary; null without one.
+   */
+  left_kind: ("marking" | "road_edge") | null;
+  /**
+   * Kind of the right boundary; null without one.
+   */
+  right_kind: ("marking" | "road_edge") | null;
+  offset: number | null;
+  offset_sigma: number | null;
+  /**
+   * Offset in meters, positive to the right of the center.
+   */
+  offset_m: number | null;
+  offset_m_sigma: number | null;
+  /**
+   * Lane width in meters.
+   */
+  lane_width_m: number | null;
+  lane_width_m_sigma: number | null;
+  /**
+   * Angle from the vehicle's heading to the lane's in radians, positive to the left.
+   */
+  heading: number | null;
+  heading_sigma: number | null;
+  /**
+   * Curvature of the lane in 1/m, positive if it curves to the left.
+   */
+  curvature: number | null;
+  curvature_sigma: number | null;
+  /**
+   * Speed of the vehicle across its lane in m/s, positive to the right.
+   */
+  lateral_speed: number | null;
+  lateral_speed_sigma: number | null;
+}
+/**
+ * Whether the vehicle leaves its lane, and on which side.
+ */
+export interface DepartureModel {
+  /**
+   * `warning` before its wheels cross a boundary, `crossed` from then until they are back inside.
+   */
+  state: "none" | "warning" | "crossed";
+  /**
+   * Null if the state is `none`.
+   */
+  side: ("left" | "right") | null;
+  /**
+   * Seconds until the wheels on the side that the vehicle approaches reach its boundary, at most 10; 0 beyond it. Null if it approaches none.
+   */
+  time_to_crossing: number | null;
+}
+/**
+ * The estimated direction of the camera in degrees, if `start` had `auto` for its pitch or its yaw.
+ */
+export interface CalibrationModel {
+  /**
+   * Pitch of the camera, positive if it looks down.
+   */
+  pitch: number;
+  pitch_sigma: number;
+  /**
+   * Yaw of the camera, positive if it looks to the left.
+   */
+  yaw: number;
+  yaw_sigma: number;
+  /**
+   * Whether the estimate is good enough to be used.
+   */
+  settled: boolean;
+}
+/**
+ * The vehicle's middle, or the camera if that is unknown, crossed a lane boundary.
+ */
+export interface LaneChangeModel {
+  type: "lane_change";
+  track_id: number;
+  direction: "left" | "right";
+  /**
+   * Time of the crossing, interpolated between frames.
+   */
+  timestamp: number;
+}
+/**
+ * A departure warning began, or the vehicle's wheels crossed a boundary of its lane.
+ */
+export interface DepartureEventModel {
+  type: "departure";
+  state: "warning" | "crossed";
+  side: "left" | "right";
+  track_id: number;
+  /**
+   * Time of the warning or the crossing, interpolated between frames.
+   */
+  timestamp: number;
+}
+/**
+ * The frame shows another scene than the one before: all track ids are new.
+ */
+export interface SceneCutModel {
+  type: "scene_cut";
+  timestamp: number;
+}
+/**
+ * The camera points in another direction than before, in degrees.
+ */
+export interface CalibrationChangedModel {
+  type: "calibration_changed";
+  pitch: number;
+  yaw: number;
+  timestamp: number;
+}
+/**
+ * Duration of each stage in milliseconds. `total` is their sum.
+ */
+export interface TimingModel {
+  /**
+   * Decoding the image file.
+   */
+  decode: number;
+  /**
+   * Working image, ego-lane prior and candidates, without the networks.
+   */
+  propose: number;
+  /**
+   * Waiting before the frame was processed.
+   */
+  queue: number;
+  /**
+   * Waiting for the networks.
+   */
+  infer: number;
+  /**
+   * Fitting curves to the paint.
+   */
+  fit: number;
+  /**
+   * The tracker.
+   */
+  track: number;
+  /**
+   * From the frame's arrival to its reply.
+   */
+  total: number;
+}
+/**
+ * Service: what the client sends is accepted, but probably wrong. Each code comes at most once in a session.
+ */
+export interface WarningMessage {
+  type: "warning";
+  code: "timestamps_in_milliseconds" | "timestamps_not_advancing";
+  message: string;
+  hint: string;
+  /**
+   * The frame that showed it.
+   */
+  seq: number;
+}
+/**
+ * Service: an error. With a `seq` it answers that frame; a fatal error ends the stream.
+ */
+export interface ErrorMessage {
+  type: "error";
+  code: string;
+  message: string;
+  hint: string;
+  seq: number | null;
+  fatal: boolean;
+}
+/**
+ * Service: it is about to stop. It answers the frames it holds, refuses later ones, then closes the socket.
+ *
+ * The session can be resumed on another replica, or on this one after its restart.
+ */
+export interface DrainingMessage {
+  type: "draining";
+  /**
+   * Null if the stream was opened without `start`.
+   */
+  resume_token: string | null;
+  /**
+   * The socket is closed after this many seconds at the latest.
+   */
+  deadline_s: number;
+}
+/**
+ * Service: the reply to `end` with the counts of all frames received over this socket.
+ *
+ * `frames` is the number of received frames, each of which was answered, failed or dropped.
+ */
+export interface SummaryMessage {
+  type: "summary";
+  frames: number;
+  answered: number;
+  failed: number;
+  dropped: number;
+  duration_s: number;
+}
+/**
+ * The loaded networks. The first one belongs to the default detector.
+ */
+export interface ModelList {
+  models: ModelEntry[];
+}
+/**
+ * A loaded network with the SHA-256 of its file and the file's metadata.
+ */
+export interface ModelEntry {
+  name: string;
+  detector: string;
+  provider: string;
+  sha256: string;
+  metadata: {
+    [k: string]: unknown;
+  };
+}
+/**
+ * The body of every error response.
+ */
+export interface Problem {
+  code: string;
+  message: string;
+  hint: string;
+}
