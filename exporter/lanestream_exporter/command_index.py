@@ -21,8 +21,13 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "data": {
         "target": "lanestream_exporter.data_commands:data",
-        "extra": "export",
+        "extra": "data",
         "help": "Inspect and prepare labeled frames.",
+    },
+    "label": {
+        "target": "lanestream_exporter.label_commands:label",
+        "extra": "data,service,cpu",
+        "help": "Write the lanes in images or a video as labels to correct.",
     },
     "train": {
         "target": "lanestream_exporter.training_commands:train",
@@ -41,7 +46,7 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "score": {
         "target": "lanestream_exporter.evaluation_commands:score",
-        "extra": "export,service,cpu",
+        "extra": "data,service,cpu",
         "help": "Measure a stream's results against labels.",
     },
 }

@@ -23,6 +23,7 @@ from lanestream_exporter.datasets.entries import FieldValue, LabelEntry
 from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.formats import AUTO, FORMATS
 from lanestream_exporter.datasets.images import ImageReader, video_size
+from lanestream_exporter.datasets.label_map import LabelMap
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
 from lanestream_exporter.datasets.labels import Coverage, LabeledFrame, LabeledImages, LabeledLane
 from lanestream_exporter.datasets.reading import labeled_frame, open_entry, read_entries
@@ -61,10 +62,11 @@ class CoverageSection(Section):
 class DatasetSpec(Section):
     """One data set of a manifest: a folder or a label file, its split rule, and whom to credit for it.
 
-    `default_kind` is that of labels without type and color. `group` and `horizon` name the field of a record with the
-    drive, and the one with the horizon's row as a share of the height. Records with one of the fields `skip` are left
-    out. In records whose fields have one of the values in `ignore_colors`, colors are not trusted. `masks` are boxes
-    (left, top, right, bottom) in shares of width and height, such as logos; they are painted over in still images.
+    `labels` says what the labels of a drawing program mean, and `default_kind` is that of boundaries without type and
+    color. `group` and `horizon` name the field of a record with the drive, and the one with the horizon's row as a
+    share of the height. Records with one of the fields `skip` are left out. In records whose fields have one of the
+    values in `ignore_colors`, colors are not trusted. `masks` are boxes (left, top, right, bottom) in shares of width
+    and height, such as logos; they are painted over in still images.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -73,6 +75,7 @@ class DatasetSpec(Section):
     split: SplitField
     group: str | None = None
     coverage: CoverageSection = CoverageSection()
+    labels: LabelMap = LabelMap()
     default_kind: BoundaryKind | None = None
     horizon: str | None = None
     skip: tuple[str, ...] = ()
@@ -261,7 +264,7 @@ class DatasetCollection:
 
     def _read(self, spec: DatasetSpec) -> Iterator[LabelEntry]:
         """Yields the records of a data set without opening its images."""
-        for entry in read_entries(self._path(spec), spec.format):
+        for entry in read_entries(self._path(spec), spec.format, spec.labels):
             if isinstance(entry, LabelError):
                 raise entry
             if not any(name in entry.fields for name in spec.skip):
