@@ -45,7 +45,7 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
         "help": "Measure the accuracy of models and of tracking.",
     },
     "score": {
-        "target": "lanestream_exporter.evaluation_commands:score",
+        "target": "lanestream_exporter.score_commands:score",
         "extra": "data,service,cpu",
         "help": "Measure a stream's results against labels.",
     },

@@ -1,4 +1,4 @@
-"""The commands `evaluate`, `evaluate tracking` and `score`."""
+"""The commands `evaluate` and `evaluate tracking`."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from lanestream.errors import ModelError, needs_extra
 from lanestream.writing import check_file, check_folder, writing
 from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
+from lanestream_exporter.datasets.label_map import BY_WORDS, LabelMap
 from lanestream_exporter.datasets.manifest import DatasetCollection
 from lanestream_exporter.datasets.reading import read_dataset
 from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
 from lanestream_exporter.evaluation.measuring import NO_EXTRAS, USUAL_EXTRAS, EvaluationSet, run_evaluation
 from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
-from lanestream_exporter.evaluation.score import score_results
 from lanestream_exporter.evaluation.tables import figure_tables
 from lanestream_exporter.evaluation.tracking.figures import all_figures
 from lanestream_exporter.evaluation.tracking.real import real_clips, run_real
 from lanestream_exporter.evaluation.tracking.rendered import RenderedSet, run_rendered
 from lanestream_exporter.evaluation.tracking.systems import AGAINST, PRESENT, SystemSpec
 from lanestream_exporter.evaluation.tracking.tables import tracking_tables
+from lanestream_exporter.label_option import LABEL_MAP
 from lanestream_exporter.scenes.tracking_clips import KINDS
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ _MIN_TRACKING_WIDTH: Final = 150
 @click.option(
     "--format", "format_name", type=click.Choice([AUTO, *FORMATS]), default=AUTO, help="The format of your labels."
 )
+@LABEL_MAP
 @click.option(
     "--labels-only", is_flag=True,
     help="Leave out the pictures without a road, the rendered towns and the stills.",
@@ -79,6 +81,7 @@ def evaluate(
     data: Path | None,
     manifest: Path | None,
     format_name: str,
+    labels: LabelMap,
     labels_only: bool,
 ) -> None:
     """Evaluate model files and two classical baselines on labeled frames.
@@ -91,7 +94,7 @@ def evaluate(
         _refuse_options(context)
         return
     _check_targets(out, json_path)
-    evaluation_set = _evaluation_set(data, manifest, format_name, split)
+    evaluation_set = _evaluation_set(data, manifest, format_name, labels, split)
     evaluation = run_evaluation(
         _methods(models, regressor),
         evaluation_set,
@@ -184,21 +187,17 @@ def evaluate_tracking(
             write_plots(plots, figures, runs)
 
 
-@click.command()
-@click.argument("results", type=click.Path(path_type=Path))
-@click.argument("labels", type=click.Path(path_type=Path))
-def score(results: Path, labels: Path) -> None:
-    """Evaluate RESULTS, a file that `stream --jsonl` wrote, against the LABELS of the clip."""
-    click.echo(json.dumps(score_results(results, labels), indent=2))
-
-
-def _evaluation_set(data: Path | None, manifest: Path | None, format_name: str, split: Split) -> EvaluationSet:
+def _evaluation_set(
+    data: Path | None, manifest: Path | None, format_name: str, labels: LabelMap, split: Split
+) -> EvaluationSet:
     """Returns a split of the manifest, or all labeled frames in `data` if it has none of the shipped data sets."""
     datasets = DatasetCollection.open(manifest, data)
     if data is None or manifest is not None or (format_name == AUTO and datasets.any_present):
+        if labels != BY_WORDS:
+            raise click.UsageError("--label is for a folder of your own; a manifest has `labels`")
         return EvaluationSet.of_split(datasets, split)
     name = format_of(DataFolder.at(data), format_name)
-    return EvaluationSet(data.name, lambda: read_dataset(data, name))
+    return EvaluationSet(data.name, lambda: read_dataset(data, name, labels))
 
 
 def _refuse_options(context: click.Context) -> None:

@@ -40,7 +40,8 @@ from lanestream_exporter.datasets.splits import (
 from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, Share, read_toml
 
 SHIPPED_MANIFEST: Final = CONFIG_FOLDER / "datasets.toml"
-_SHIPPED_DATA: Final = Path("../shared/data")
+SHIPPED_DATA: Final = Path("../shared/data")
+_FETCH: Final = "`lanestream data fetch` shows where it comes from; name its folder with --data or LANESTREAM_DATA"
 _SIDES: Final = {"left": -1, "right": 1}
 _HORIZON_SHARES: Final = (-0.6, 1.0)  # of the height; the camera looks down if it is negative
 
@@ -160,10 +161,14 @@ class LabeledClip:
 
 @dataclass(frozen=True)
 class DatasetCollection:
-    """The data sets of a manifest in a data folder, with their frames by split."""
+    """The data sets of a manifest in a data folder, with their frames by split.
+
+    `is_shipped` is true for the shipped manifest, whose data sets are public.
+    """
 
     manifest: DatasetManifest
     root: Path
+    is_shipped: bool = False
 
     @classmethod
     def open(cls, manifest: Path | None = None, data: Path | None = None) -> DatasetCollection:
@@ -174,9 +179,8 @@ class DatasetCollection:
         """
         path = manifest or SHIPPED_MANIFEST
         read = read_toml(path, DatasetManifest, "give a manifest of data sets, a TOML file")
-        named = data or os.environ.get("LANESTREAM_DATA")
-        default = _SHIPPED_DATA if manifest is None else path.parent
-        return cls(read, Path(named) if named else default)
+        root = data_folder(data, SHIPPED_DATA if manifest is None else path.parent)
+        return cls(read, root, is_shipped=manifest is None)
 
     def without(self, names: Collection[str]) -> DatasetCollection:
         """Returns the collection without the data sets of these names. Raises SettingsError for an unknown name."""
@@ -276,10 +280,10 @@ class DatasetCollection:
     def _path(self, spec: DatasetSpec) -> Path:
         path = self.root / spec.path
         if not self._is_present(spec):
-            raise LabelError(
-                f"the data set {spec.name!r} is missing: there is nothing at {path}",
-                "give the folder that the manifest's paths count from with --data or LANESTREAM_DATA",
-            )
+            hint = "give the folder that the manifest's paths count from with --data or LANESTREAM_DATA"
+            # The usual folder of the shipped data sets is not one that the user named.
+            where = "" if self.root == SHIPPED_DATA else f": there is nothing at {path}"
+            raise LabelError(f"the data set {spec.name!r} is missing{where}", _FETCH if self.is_shipped else hint)
         return path
 
     @cached_property
@@ -306,6 +310,12 @@ class DatasetCollection:
                         "put each drive or clip into one split only",
                     )
         return chosen
+
+
+def data_folder(given: Path | None, default: Path = SHIPPED_DATA) -> Path:
+    """Returns the folder that data sets are in: the `given` one, else $LANESTREAM_DATA, else the `default`."""
+    named = given or os.environ.get("LANESTREAM_DATA")
+    return Path(named) if named else default
 
 
 def origin_of(collection: DatasetCollection | None, rendered_scenes: int) -> dict[str, Any]:
