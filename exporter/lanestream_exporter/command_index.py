@@ -46,7 +46,7 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "score": {
         "target": "lanestream_exporter.score_commands:score",
-        "extra": "data,service,cpu",
+        "extra": "data",
         "help": "Measure a stream's results against labels.",
     },
 }
