@@ -68,7 +68,9 @@ def label(
     for error in skipped:
         click.echo(f"skipped: {error}", err=True)
     if not frames:
-        raise SourceError("none of the images can be used" if paths else f"{inputs[0]} has no frames", "listed above")
+        if paths is None:
+            raise SourceError(f"{inputs[0]} has no frames", "give a video that can be decoded")
+        raise SourceError("none of the images can be used", "the reasons are listed above")
     _print_summary(frames, len(all_frames), written, out)
 
 
