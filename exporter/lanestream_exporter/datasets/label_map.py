@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from typing import Final, Literal, Self, get_args
 
-from pydantic import model_validator
+from pydantic import ValidationError, model_validator
 
 from lanestream.errors import SettingsError
 from lanestream.road.appearance import MARKING_COLORS, MARKING_TYPES
@@ -23,12 +23,13 @@ MEANINGS: Final[tuple[Meaning, ...]] = get_args(Meaning)
 
 _BOUNDARY_WORDS: Final = frozenset(
     {"line", "lines", "marking", "markings", "boundary", "boundaries", "border", "divider", "separator"}
+    | {"centerline", "centreline", "edgeline", "roadline"}
 )
 _BOUNDARY_START: Final = "lane"  # also of lanes, laneline and lanemarking
 # Words of what is not a boundary, even if the label has a word like lane or line.
 _OTHER_WORDS: Final = frozenset(
     {"area", "region", "drivable", "surface", "stop", "crosswalk", "crosswalks", "crossing", "zebra", "arrow", "arrows"}
-    | {"ignore", "ignored", "horizon", "hood", "bonnet"}
+    | {"stopline", "ignore", "ignored", "horizon", "hood", "bonnet"}
 )
 # A line may be named only by these, and by numbers.
 _LINE_WORDS: Final = frozenset(
@@ -65,10 +66,11 @@ class LabelMap(Section):
             label, separator, meaning = pair.rpartition("=")
             if not separator or not label or meaning not in labels:
                 raise SettingsError(f"{pair!r} doesn't map a label", f"give LABEL={'|'.join(MEANINGS)}")
-            if any(_normal(label) == _normal(known) for given in labels.values() for known in given):
-                raise SettingsError(f"the label {label!r} is mapped twice", "map each label once")
             labels[meaning].append(label)
-        return cls.model_validate(labels)
+        try:
+            return cls.model_validate(labels)
+        except ValidationError as error:
+            raise SettingsError(str(error.errors()[0]["ctx"]["error"])) from None
 
     def meaning(self, label: str) -> Meaning | None:
         """Returns what a label means; None if neither the map nor its words say."""
@@ -82,8 +84,8 @@ class LabelMap(Section):
 
     def meaning_of_line(self, label: str) -> Meaning | None:
         """Returns what the label of a drawn line means, which may also say only where or of what color the line is."""
-        words = words_of(label)
-        return self.meaning(label) or ("lane" if _LINE_WORDS.issuperset(words) else None)
+        says_where = label.isascii() and _LINE_WORDS.issuperset(words_of(label))
+        return self.meaning(label) or ("lane" if says_where else None)
 
     def look(self, label: str, types: Iterable[str] = (), colors: Iterable[str] = ()) -> LabeledLook:
         """Returns how a boundary looks, by its label and by the lower-case words of its attributes, which go first.
@@ -120,7 +122,7 @@ BY_WORDS: Final = LabelMap()
 
 
 def words_of(label: str) -> list[str]:
-    """Returns the words of a label in lower case: solid and white of `solid_white` and of `SolidWhite`."""
+    """Returns the ASCII words of a label in lower case: solid and white of `solid_white` and of `SolidWhite`."""
     return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", label)]
 
 

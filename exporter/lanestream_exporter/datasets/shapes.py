@@ -13,15 +13,17 @@ a shape of another tool is ignored.
 
 from __future__ import annotations
 
+import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 import numpy as np
 
-from lanestream.errors import LabelError
+from lanestream.errors import LabelError, one_line
 from lanestream.road.curve import FloatArray
 from lanestream_exporter.datasets.label_map import MEANINGS, LabelMap, Meaning
 from lanestream_exporter.datasets.labels import LabeledLane
@@ -37,6 +39,7 @@ _POLYGON: Final = "polygon"
 _THICKEST: Final = 0.05  # of the image's width, on average over a polygon's length
 _SHARPEST_TURN: Final = 45.0  # degrees, of a polygon that was meant as a line
 _TRIANGLE_TURN: Final = 20.0  # degrees, of one with three corners, which may be the outline of a marking that tapers
+_LONGEST_LABEL: Final = 80  # characters in errors
 _LEAST_STEP: Final = 3.0  # pixels sideways that count as a change of direction
 
 
@@ -116,11 +119,12 @@ def no_boundaries(path: Path, others: Counter[str]) -> LabelError:
 
 def unknown_label(location: str, label: str) -> LabelError:
     """Returns the error of a line at `location` whose label means nothing."""
-    means = ", ".join(MEANINGS[:-1])
+    means, name = ", ".join(MEANINGS[:-1]), one_line(label, _LONGEST_LABEL)
     return LabelError(
-        f"{location}: the label {label!r} of a line is not known",
-        f"say what it means, {means} or {MEANINGS[-1]}: with --label {label}=ignore, or with "
-        f'labels = {{ ignore = ["{label}"] }} in the manifest; labels with a word like lane, line or kerb are known',
+        f"{location}: the label {name!r} of a line is not known",
+        f"say what it means, {means} or {MEANINGS[-1]}: with --label {quote(f'{name}=ignore')}, or with "
+        f"labels = {{ ignore = [{json.dumps(name, ensure_ascii=False)}] }} in the manifest; labels with a word like "
+        "lane, line or kerb are known",
     )
 
 

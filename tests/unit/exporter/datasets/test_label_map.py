@@ -41,8 +41,10 @@ from lanestream_exporter.datasets.reading import read_dataset
         ("stop_line", "ignore"),
         ("Crosswalk", "ignore"),
         ("lane_arrow", "ignore"),
+        ("centerline", "lane"),
         ("guardrail", None),
         ("white van", None),
+        ("\u505c\u6b62\u7ebf", None),
     ],
 )
 def test_lines_mean_what_their_words_say(label: str, meaning: str | None) -> None:
@@ -102,6 +104,15 @@ def test_an_unknown_label_is_one_error_that_says_how_to_map_it(tmp_path: Path, d
         read(tmp_path)
 
 
+def test_the_error_of_a_label_is_one_line_that_can_be_pasted(tmp_path: Path, draw: Draw) -> None:
+    write_drawings(tmp_path, draw, 'tram "rail"\n2')
+    (fault,) = faults(tmp_path)
+    assert "--label 'tram \"rail\" 2=ignore'" in fault
+    assert 'labels = { ignore = ["tram \\"rail\\" 2"] }' in fault
+    labels = LabelMap.of(['tram "rail" 2=ignore'])
+    assert [len(frame.lanes) for frame, _ in read_dataset(tmp_path, labels=labels)] == [1]
+
+
 def test_a_map_says_what_the_labels_of_a_data_set_mean(tmp_path: Path, draw: Draw) -> None:
     write_drawings(tmp_path, draw, "guardrail", "median")
     labels = LabelMap(road_edge=("guardrail",), ignore=("median",))
@@ -145,7 +156,7 @@ def test_a_map_with_mistakes_is_refused(tmp_path: Path) -> None:
     for pair in ("paint", "=lane", "paint=line"):
         with pytest.raises(SettingsError, match="doesn't map a label"):
             LabelMap.of([pair])
-    with pytest.raises(SettingsError, match="the label 'Paint' is mapped twice"):
+    with pytest.raises(SettingsError, match="the label 'paint' is listed twice"):
         LabelMap.of(["paint=lane", "Paint=ignore"])
 
 
