@@ -29,6 +29,7 @@ from lanestream_exporter.datasets.files import (
     json_value,
     path_in_labels,
     read_text,
+    start_of,
 )
 from lanestream_exporter.datasets.images import ImageLocation
 from lanestream_exporter.datasets.label_map import LabelMap, words_of
@@ -55,21 +56,23 @@ def is_label_studio(path: Path, start: bytes) -> bool:
 def label_studio_entries(folder: DataFolder, labels: LabelMap) -> LabelEntries:
     """Yields the annotated tasks of all JSON files. A group is the folder of the images."""
     for path in folder.with_suffix(".json"):
+        # A folder may hold JSON files of another kind, such as a camera's calibration.
+        if not is_label_studio(path, start_of(path)):
+            continue
         try:
             tasks = json_value(read_text(path, _ACCEPTED), str(path), _ACCEPTED)
         except LabelError as error:
             yield error
             continue
-        # A folder may hold JSON files of another kind, such as a camera's calibration.
-        for number, task in enumerate(tasks if isinstance(tasks, list) else [], start=1):
+        if not isinstance(tasks, list) or not all(isinstance(task, dict) and "data" in task for task in tasks):
+            yield LabelError(f"{path} is not a list of Label Studio's tasks", _ACCEPTED)
+            continue
+        for number, task in enumerate(tasks, start=1):
             yield from _entries(task, number, path, folder, labels)
 
 
-def _entries(task: Any, number: int, path: Path, folder: DataFolder, labels: LabelMap) -> LabelEntries:
+def _entries(task: Mapping[str, Any], number: int, path: Path, folder: DataFolder, labels: LabelMap) -> LabelEntries:
     """Yields the frame of a task that is annotated, or what is wrong with it."""
-    if not isinstance(task, dict) or "data" not in task:
-        yield LabelError(f"{path}: element {number} is not a task of Label Studio", _ACCEPTED)
-        return
     location = f"{path}: task {task.get('id', number)}"
     try:
         annotation = _annotation(task)

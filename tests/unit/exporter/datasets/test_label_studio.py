@@ -125,7 +125,7 @@ def test_only_annotations_count(drive: Path, draw: Draw) -> None:
 @pytest.mark.parametrize(
     ("element", "expected"),
     [
-        ({"image": "a.jpg", "label": [{"original_width": 5}]}, "element 1 is not a task of Label Studio (export"),
+        ({"image": "a.jpg", "label": [{"original_width": 5}]}, "is not a list of Label Studio's tasks (export"),
         (task(annotation(vector(LEFT)), image="gone.jpg"), "task 7: there is no file gone.jpg"),
         (task(annotation(vector(LEFT)), image="a.mp4"), "task 7: its data has no image whose name ends in .jpg"),
         (task(annotation({**vector(LEFT), "image_rotation": 90})), "region r1: its image was rotated"),
