@@ -22,7 +22,7 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
     "data": {
         "target": "lanestream_exporter.data_commands:data",
         "extra": "data",
-        "help": "Inspect and prepare labeled frames.",
+        "help": "Check labeled frames, and find public ones.",
     },
     "label": {
         "target": "lanestream_exporter.label_commands:label",
