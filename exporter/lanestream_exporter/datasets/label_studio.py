@@ -54,7 +54,11 @@ def is_label_studio(path: Path, start: bytes) -> bool:
 
 
 def label_studio_entries(folder: DataFolder, labels: LabelMap) -> LabelEntries:
-    """Yields the annotated tasks of all JSON files. A group is the folder of the images."""
+    """Yields the annotated tasks of all JSON files. A group is the folder of the images.
+
+    It is an error if no task is annotated.
+    """
+    unlabeled, found = 0, False
     for path in folder.with_suffix(".json"):
         # A folder may hold JSON files of another kind, such as a camera's calibration.
         if not is_label_studio(path, start_of(path)):
@@ -68,7 +72,14 @@ def label_studio_entries(folder: DataFolder, labels: LabelMap) -> LabelEntries:
             yield LabelError(f"{path} is not a list of Label Studio's tasks", _ACCEPTED)
             continue
         for number, task in enumerate(tasks, start=1):
-            yield from _entries(task, number, path, folder, labels)
+            entries = list(_entries(task, number, path, folder, labels))
+            unlabeled, found = unlabeled + (not entries), found or bool(entries)
+            yield from entries
+    if unlabeled and not found:
+        yield LabelError(
+            f"none of the {unlabeled} tasks in {folder.root} is annotated",
+            "predictions are not labels: submit the tasks in Label Studio, and export them as JSON",
+        )
 
 
 def _entries(task: Mapping[str, Any], number: int, path: Path, folder: DataFolder, labels: LabelMap) -> LabelEntries:

@@ -122,6 +122,13 @@ def test_only_annotations_count(drive: Path, draw: Draw) -> None:
     assert [len(frame.lanes) for frame in read(drive)] == [1, 0]
 
 
+def test_predictions_alone_are_an_error(drive: Path) -> None:
+    write(drive, {**task(), "predictions": [{"result": [vector(LEFT)]}]}, task(annotation(was_cancelled=True)))
+    (fault,) = faults(drive)
+    assert "none of the 2 tasks in" in fault
+    assert "predictions are not labels: submit the tasks" in fault
+
+
 @pytest.mark.parametrize(
     ("element", "expected"),
     [
