@@ -21,6 +21,7 @@ import click
 
 from lanestream import __version__
 from lanestream.errors import CameraLostError, LanestreamError, needs_extra, needs_whole_packages
+from lanestream.host import memory, processors
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES
 from lanestream.keys import new_key
 
@@ -32,6 +33,9 @@ _EXIT_FAILED: Final = 1
 _EXIT_CAMERA_LOST: Final = 3
 _EXIT_INTERRUPTED: Final = 130
 _EXIT_TERMINATED: Final = 143
+
+# The memory that a process with an engine may need for frames of any usual size.
+_ENGINE_BYTES: Final = 600e6
 
 # Each entry point of this group is a mapping from a command's name to the fields of a MountedCommand.
 _COMMANDS_GROUP: Final = "lanestream.commands"
@@ -61,6 +65,29 @@ class MountedCommand:
 _DOCTOR: Final = MountedCommand(
     "lanestream.doctor:doctor", "service,cpu", "Report which execution providers work here, and how fast."
 )
+
+
+class LocalEngines:
+    """Loads engines for the commands that work in this process; see LoadEngine in the client."""
+
+    def __call__(
+        self, model: Path | None, provider: str | None, regressor: Path | None, threads: int | None = None
+    ) -> LocalEngine:
+        """Returns a warm engine. Raises BadParameter, ModelError and ProviderError."""
+        chosen = next((known for known in PROVIDER_NAMES if known == (provider or AUTO)), None)
+        if chosen is None:
+            raise click.BadParameter(
+                f"{provider!r} is not one of {', '.join(PROVIDER_NAMES)}.",
+                ctx=click.get_current_context(silent=True),
+                param_hint="'--provider'",
+            )
+        with needs_extra("service,cpu"):
+            from lanestream.local import LocalEngine
+        return LocalEngine.load(model, chosen, regressor, threads)
+
+    def most_processes(self) -> int:
+        """Returns how many processes with an engine of one thread this machine has processors and memory for."""
+        return max(1, min(processors(), int(memory() / _ENGINE_BYTES)))
 
 
 class CommandGroup(click.Group):
@@ -97,7 +124,7 @@ class CommandGroup(click.Group):
 @click.pass_context
 def cli(context: click.Context) -> None:
     """Camera frames in, tracked lane lines out."""
-    context.obj = _load_local_engine
+    context.obj = LocalEngines()
 
 
 @cli.command()
@@ -187,20 +214,6 @@ def _terminate(*_: object) -> None:
     While the service runs, uvicorn's handler replaces this one.
     """
     os._exit(_EXIT_TERMINATED)
-
-
-def _load_local_engine(model: Path | None, provider: str | None, regressor: Path | None) -> LocalEngine:
-    """Loads an engine for the commands that work in this process; see LoadEngine in the client."""
-    chosen = next((known for known in PROVIDER_NAMES if known == (provider or AUTO)), None)
-    if chosen is None:
-        raise click.BadParameter(
-            f"{provider!r} is not one of {', '.join(PROVIDER_NAMES)}.",
-            ctx=click.get_current_context(),
-            param_hint="'--provider'",
-        )
-    with needs_extra("service,cpu"):
-        from lanestream.local import LocalEngine
-    return LocalEngine.load(model, chosen, regressor)
 
 
 def _load_overlay() -> Callable[..., Any] | None:
