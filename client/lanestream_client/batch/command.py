@@ -19,13 +19,15 @@ from lanestream_client.batch.gpx import find_tracks
 from lanestream_client.batch.outputs import Format, create_folders
 from lanestream_client.batch.pool import WorkerPool
 from lanestream_client.batch.processing import BatchJob, EngineInfo
+from lanestream_client.batch.ray_runner import RayCluster
 from lanestream_client.batch.report import BatchReport, print_summary, write_summary
 from lanestream_client.batch.state import BatchState, open_state
 from lanestream_client.batch.units import SourceFile, find_files, units_of
 from lanestream_client.options import chosen_camera, detection_options, network_options
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Sequence
+    from contextlib import AbstractContextManager
     from types import FrameType
 
     from lanestream_client.batch.pool import ReportBytes
@@ -36,13 +38,13 @@ _EXIT_SIGNAL: Final = 128  # plus the number of the signal, as shells report it
 
 
 class Executor(Protocol):
-    """Where units are processed. It is a context manager, which ends what it has started."""
+    """Where units are processed."""
 
     def start(self) -> EngineInfo | None:
         """Returns what runs in the workers; None if it was stopped."""
         ...
 
-    def run(self, units: Iterable[Unit], report: ReportBytes) -> Iterator[UnitResult]:
+    def run(self, units: Sequence[Unit], report: ReportBytes) -> Iterator[UnitResult]:
         """Yields the outcomes of all units as they come, until it is stopped."""
         ...
 
@@ -140,7 +142,7 @@ def batch(
         tracks=None if gpx is None else find_tracks(gpx.absolute(), gpx_offset or 0.0, notify),
     )
     with open_state(job.out) as state, _stop_signals() as stop:
-        with _executor(job, processes or context.obj.most_processes(), ray, stop) as executor:
+        with _executor(job, processes, ray, stop) as executor:
             failed = _run(job, gpx, state, executor, files, retry_failed)
         if stop.signal is not None:
             click.echo("stopped; the same command continues", err=True)
@@ -190,8 +192,12 @@ def _settings(job: BatchJob, gpx: Path | None, info: EngineInfo) -> dict[str, An
     }
 
 
-def _executor(job: BatchJob, processes: int, ray: str | None, stop: StopSignals) -> WorkerPool:
-    return WorkerPool(job, processes, stop.received)
+def _executor(
+    job: BatchJob, processes: int | None, ray: str | None, stop: StopSignals
+) -> AbstractContextManager[Executor]:
+    if ray is not None:
+        return RayCluster(job, ray, processes, stop.received)
+    return WorkerPool(job, processes or job.load.most_processes(), stop.received)
 
 
 class StopSignals:

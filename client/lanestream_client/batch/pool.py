@@ -6,20 +6,17 @@ import multiprocessing
 import signal
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from threading import Event
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 from lanestream.errors import WorkerLostError
 from lanestream_client.batch.processing import BatchJob, EngineInfo
 from lanestream_client.batch.state import UnitResult
 from lanestream_client.batch.units import Unit
 from lanestream_client.batch.worker import Progress, Stopped, run_worker
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 # How long the pool waits at a time, in seconds. After the batch was suspended, only one such step has passed.
 _STEP_S: Final = 0.25
@@ -74,7 +71,7 @@ class WorkerPool:
                 return message
         return None
 
-    def run(self, units: Iterable[Unit], report: ReportBytes) -> Iterator[UnitResult]:
+    def run(self, units: Sequence[Unit], report: ReportBytes) -> Iterator[UnitResult]:
         """Yields the outcomes of all units as they come, until it is stopped.
 
         Raises WriteError if results can't be written, and WorkerLostError if no worker can be started any more.

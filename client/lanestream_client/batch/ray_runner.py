@@ -1,0 +1,160 @@
+"""The workers of a batch on a Ray cluster, by Ray Data: actors with an engine each, which take one unit at a time.
+
+They write their results to the folder of the batch, which all machines must have at the same path. Only the batch itself
+records and publishes them, so a unit that Ray runs again does not appear twice.
+"""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from queue import Empty, SimpleQueue
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from lanestream.errors import BatchError, LanestreamError, needs_extra, one_line
+from lanestream_client.batch.processing import BatchJob, EngineInfo, UnitProcessor
+from lanestream_client.batch.state import UnitResult
+from lanestream_client.batch.units import Unit
+from lanestream_client.batch.worker import Stopped
+
+if TYPE_CHECKING:
+    from lanestream_client.batch.pool import ReportBytes
+
+# How often Ray runs a unit again whose actor or machine has died.
+_RETRIES: Final = 3
+_STEP_S: Final = 0.25
+
+
+class RayCluster:
+    """Processes units on the cluster at `address`, in at most so many processes; None: one for each of its processors.
+
+    As a context manager it connects to the cluster and disconnects, which ends its actors. Raises BatchError if there
+    is no cluster, and MissingExtraError without Ray.
+    """
+
+    def __init__(self, job: BatchJob, address: str, processes: int | None, stop: Event) -> None:
+        self._job = job
+        self._address = address
+        self._processes = processes
+        self._stop = stop
+
+    def __enter__(self) -> Self:
+        with needs_extra("ray"):
+            import ray
+            import ray.data
+        try:
+            ray.init(self._address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise BatchError(
+                f"no Ray cluster at {self._address}: {one_line(error)}", "give the address that `ray start` printed"
+            ) from None
+        logging.getLogger("ray.data").setLevel(logging.CRITICAL)
+        context = ray.data.DataContext.get_current()
+        context.enable_progress_bars = False
+        # A unit that kills its actor again and again costs only itself; it is missing in the end.
+        context.max_errored_blocks = -1
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        import ray
+
+        ray.shutdown()
+
+    def start(self) -> EngineInfo | None:
+        """Returns what runs in the workers; None if it was stopped. Raises the errors of UnitProcessor."""
+        import ray
+
+        info = ray.remote(_describe).remote(self._job)
+        for outcome in self._received(lambda: iter([ray.get(info)])):
+            assert isinstance(outcome, EngineInfo)  # noqa: S101 - what _describe returns
+            return outcome
+        return None
+
+    def run(self, units: Sequence[Unit], report: ReportBytes) -> Iterator[UnitResult]:
+        """Yields the outcomes of all units as they come, until it is stopped. Raises WriteError."""
+        while units:
+            done = set()
+            for outcome in self._received(lambda units=units: self._outcomes(units)):  # type: ignore[misc]
+                assert isinstance(outcome, UnitResult)  # noqa: S101 - what UnitActor returns
+                done.add(outcome.unit.name)
+                yield outcome
+                report(0.0)
+            if self._stop.is_set():
+                return
+            missing = [unit for unit in units if unit.name not in done]
+            for unit in missing:
+                if len(unit.files) == 1:
+                    error = f"its worker ended {_RETRIES + 1} times, perhaps for lack of memory"
+                    yield UnitResult(unit, failed={unit.files[0].path: error})
+            # The image that ends its worker must not cost the others of its unit.
+            units = [Unit(unit.kind, (file,)) for unit in missing if len(unit.files) > 1 for file in unit.files]
+
+    def _outcomes(self, units: Sequence[Unit]) -> Iterator[UnitResult | Stopped]:
+        import ray
+        import ray.data
+
+        most = self._processes or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        # With one unit per block, and one block at a time for an actor, no unit waits for another one.
+        actors = ray.data.ActorPoolStrategy(min_size=1, max_size=min(most, len(units)), max_tasks_in_flight_per_actor=1)
+        rows = ray.data.from_items([{"unit": pickle.dumps(unit)} for unit in units], override_num_blocks=len(units))
+        outcomes = rows.map(
+            UnitActor,
+            fn_constructor_args=(self._job,),
+            compute=actors,
+            num_cpus=1,
+            max_restarts=-1,
+            max_task_retries=_RETRIES,
+        )
+        for row in outcomes.iter_rows():
+            yield pickle.loads(row["outcome"])  # noqa: S301 - from an actor of this batch
+
+    def _received(self, outcomes: Callable[[], Iterator[Any]]) -> Iterator[Any]:
+        """Yields what a thread gets from Ray, whose waits can't be interrupted, until the batch is stopped."""
+        results: SimpleQueue[Any] = SimpleQueue()
+        end = object()
+
+        def read() -> None:
+            try:
+                for outcome in outcomes():
+                    results.put(outcome)
+                results.put(end)
+            except Exception as error:
+                results.put(Stopped(LanestreamError(f"Ray failed: {type(error).__name__}: {one_line(error)}")))
+
+        Thread(target=read, daemon=True).start()
+        while not self._stop.is_set():
+            try:
+                outcome = results.get(timeout=_STEP_S)
+            except Empty:
+                continue
+            if isinstance(outcome, Stopped):
+                raise outcome.error
+            if outcome is end:
+                return
+            yield outcome
+
+
+class UnitActor:
+    """The worker that Ray Data runs: rows with a unit in, rows with its outcome out."""
+
+    def __init__(self, job: BatchJob) -> None:
+        self._processor = UnitProcessor(job)
+
+    def __call__(self, row: dict[str, bytes]) -> dict[str, bytes]:
+        """Returns the row of the outcome: a UnitResult, or Stopped if its results can't be written."""
+        outcome: UnitResult | Stopped
+        try:
+            outcome = self._processor.process(pickle.loads(row["unit"]), lambda *_: None)  # noqa: S301 - from the batch
+        except LanestreamError as error:
+            outcome = Stopped(error)
+        return {"outcome": pickle.dumps(outcome)}
+
+
+def _describe(job: BatchJob) -> EngineInfo | Stopped:
+    """Returns what runs in a worker, or why none can; runs on a machine of the cluster."""
+    try:
+        return UnitProcessor(job).engine_info
+    except LanestreamError as error:
+        return Stopped(error)
