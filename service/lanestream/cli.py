@@ -225,4 +225,7 @@ def _load_overlay() -> Callable[..., Any] | None:
 
 
 if __name__ == "__main__":
-    main()
+    # Not this module under its other name, whose classes other processes can't import.
+    import lanestream.cli
+
+    lanestream.cli.main()

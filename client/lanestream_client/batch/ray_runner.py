@@ -1,7 +1,7 @@
 """The workers of a batch on a Ray cluster, by Ray Data: actors with an engine each, which take one unit at a time.
 
-They write their results to the folder of the batch, which all machines must have at the same path. Only the batch itself
-records and publishes them, so a unit that Ray runs again does not appear twice.
+They write their results to the folder of the batch, which all machines must have at the same path. Only the batch
+itself records and publishes them, so a unit that Ray runs again does not appear twice.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from lanestream.errors import BatchError, LanestreamError, needs_extra, one_line
+from lanestream_client.batch.pool import WorkerPool
 from lanestream_client.batch.processing import BatchJob, EngineInfo, UnitProcessor
 from lanestream_client.batch.state import UnitResult
 from lanestream_client.batch.units import Unit
@@ -22,8 +23,6 @@ from lanestream_client.batch.worker import Stopped
 if TYPE_CHECKING:
     from lanestream_client.batch.pool import ReportBytes
 
-# How often Ray runs a unit again whose actor or machine has died.
-_RETRIES: Final = 3
 _STEP_S: Final = 0.25
 
 
@@ -51,10 +50,7 @@ class RayCluster:
                 f"no Ray cluster at {self._address}: {one_line(error)}", "give the address that `ray start` printed"
             ) from None
         logging.getLogger("ray.data").setLevel(logging.CRITICAL)
-        context = ray.data.DataContext.get_current()
-        context.enable_progress_bars = False
-        # A unit that kills its actor again and again costs only itself; it is missing in the end.
-        context.max_errored_blocks = -1
+        ray.data.DataContext.get_current().enable_progress_bars = False
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -73,40 +69,25 @@ class RayCluster:
         return None
 
     def run(self, units: Sequence[Unit], report: ReportBytes) -> Iterator[UnitResult]:
-        """Yields the outcomes of all units as they come, until it is stopped. Raises WriteError."""
-        while units:
-            done = set()
-            for outcome in self._received(lambda units=units: self._outcomes(units)):  # type: ignore[misc]
-                assert isinstance(outcome, UnitResult)  # noqa: S101 - what UnitActor returns
-                done.add(outcome.unit.name)
-                yield outcome
-                report(0.0)
-            if self._stop.is_set():
-                return
-            missing = [unit for unit in units if unit.name not in done]
-            for unit in missing:
-                if len(unit.files) == 1:
-                    error = f"its worker ended {_RETRIES + 1} times, perhaps for lack of memory"
-                    yield UnitResult(unit, failed={unit.files[0].path: error})
-            # The image that ends its worker must not cost the others of its unit.
-            units = [Unit(unit.kind, (file,)) for unit in missing if len(unit.files) > 1 for file in unit.files]
+        """Yields the outcomes of all units as they come, until it is stopped.
+
+        Raises WriteError, and WorkerLostError if a machine of the cluster can't start workers.
+        """
+        for outcome in self._received(lambda: self._outcomes(units)) if units else ():
+            assert isinstance(outcome, UnitResult)  # noqa: S101 - what UnitActor returns
+            yield outcome
+            report(0.0)
 
     def _outcomes(self, units: Sequence[Unit]) -> Iterator[UnitResult | Stopped]:
         import ray
         import ray.data
 
-        most = self._processes or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        processors = int(ray.cluster_resources().get("CPU", 1))
+        most = max(1, min(self._processes or processors, len(units)))
         # With one unit per block, and one block at a time for an actor, no unit waits for another one.
-        actors = ray.data.ActorPoolStrategy(min_size=1, max_size=min(most, len(units)), max_tasks_in_flight_per_actor=1)
+        actors = ray.data.ActorPoolStrategy(min_size=1, max_size=most, max_tasks_in_flight_per_actor=1)
         rows = ray.data.from_items([{"unit": pickle.dumps(unit)} for unit in units], override_num_blocks=len(units))
-        outcomes = rows.map(
-            UnitActor,
-            fn_constructor_args=(self._job,),
-            compute=actors,
-            num_cpus=1,
-            max_restarts=-1,
-            max_task_retries=_RETRIES,
-        )
+        outcomes = rows.flat_map(UnitActor, fn_constructor_args=(self._job,), compute=actors, num_cpus=1)
         for row in outcomes.iter_rows():
             yield pickle.loads(row["outcome"])  # noqa: S301 - from an actor of this batch
 
@@ -137,19 +118,23 @@ class RayCluster:
 
 
 class UnitActor:
-    """The worker that Ray Data runs: rows with a unit in, rows with its outcome out."""
+    """The worker that Ray Data runs: rows with a unit in, rows with its outcomes out.
+
+    It has a pool of one process, so that what a file can do to its worker costs only that file, and Ray restarts an
+    actor only if its machine dies.
+    """
 
     def __init__(self, job: BatchJob) -> None:
-        self._processor = UnitProcessor(job)
+        self._pool = WorkerPool(job, 1, Event())
 
-    def __call__(self, row: dict[str, bytes]) -> dict[str, bytes]:
-        """Returns the row of the outcome: a UnitResult, or Stopped if its results can't be written."""
-        outcome: UnitResult | Stopped
+    def __call__(self, row: dict[str, bytes]) -> Iterator[dict[str, bytes]]:
+        """Yields the rows of the outcomes: a UnitResult each, or Stopped if the worker can't continue."""
+        unit: Unit = pickle.loads(row["unit"])  # noqa: S301 - from the batch
         try:
-            outcome = self._processor.process(pickle.loads(row["unit"]), lambda *_: None)  # noqa: S301 - from the batch
+            for result in self._pool.run([unit], lambda _: None):
+                yield {"outcome": pickle.dumps(result)}
         except LanestreamError as error:
-            outcome = Stopped(error)
-        return {"outcome": pickle.dumps(outcome)}
+            yield {"outcome": pickle.dumps(Stopped(error))}
 
 
 def _describe(job: BatchJob) -> EngineInfo | Stopped:

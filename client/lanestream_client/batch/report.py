@@ -79,13 +79,11 @@ class BatchReport:
         self._bar.update(self._task, completed=self._finished_bytes + unfinished_bytes, description=self._status)
 
     def add(self, result: UnitResult) -> None:
-        """Counts the outcome of a unit, and prints what is wrong with its files."""
+        """Counts the outcome of a unit, and prints its notes."""
         self.counts += result.counts
         self.failed += len(result.failed)
         self.done += len(result.unit.files) - len(result.failed)
         self._finished_bytes += result.unit.size
-        for path, error in result.failed.items():
-            click.echo(f"failed: {path}: {error}", err=True)
         for note in result.notes:
             click.echo(f"warning: {note}", err=True)
 
