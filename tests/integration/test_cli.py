@@ -46,7 +46,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
         return int(caught.value.code or 0), output, errors
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider, regressor, _threads: LocalEngine(load(regressor)))
+    monkeypatch.setattr(
+        LocalEngine, "load", lambda _model, _provider, regressor, _threads: LocalEngine(load(regressor))
+    )
     return call
 
 

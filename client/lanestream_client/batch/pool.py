@@ -7,7 +7,8 @@ import signal
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from threading import Event
 from typing import Any, Final, Self
@@ -140,7 +141,8 @@ class _Worker:
         self.pipe: Connection[Unit, Any]
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=run_worker, args=(job, theirs))
-        self._process.start()
+        with _signals_blocked():
+            self._process.start()
         theirs.close()
         self._hung = False
         self._silent_s = 0.0
@@ -207,3 +209,18 @@ class _Worker:
             return f"with status {status}"
         hint = ", perhaps for lack of memory" if -status == signal.SIGKILL else ""
         return f"by {signal.Signals(-status).name}{hint}"
+
+
+@contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """Blocks the signals that end a batch, for good in the processes that are started in the block.
+
+    The terminal sends them to all processes of the batch, which itself ends its workers.
+    """
+    # It would unblock signals when it is started together with the first process.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -264,4 +264,4 @@ def _database_errors(out: Path) -> Iterator[None]:
         yield
     except sqlite3.DatabaseError as error:
         hint = "free space on the disk; if the file is damaged, use another folder for --out"
-        raise WriteError(f"can't write {out / _STATE}: {error}", hint) from None
+        raise WriteError(f"can't use {out / _STATE}: {error}", hint) from None

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from lanestream.errors import SourceError
+from lanestream.errors import SourceError, one_line
 from lanestream_client.image_files import IMAGE_SUFFIXES, natural_key
 
 VIDEO_SUFFIXES: Final = (
@@ -102,7 +102,7 @@ def find_files(sources: Sequence[str], notify: Callable[[str], object], leave_ou
         notify(f"skipped everything but videos and images ({kinds})")
     if not found:
         accepted = ", ".join((*VIDEO_SUFFIXES, *IMAGE_SUFFIXES))
-        raise SourceError(f"no videos or images in {', '.join(sources)}", f"accepted file types: {accepted}")
+        raise SourceError(f"no videos or images in {one_line(', '.join(sources))}", f"accepted file types: {accepted}")
     return list(found.values())
 
 

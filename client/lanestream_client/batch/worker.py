@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import threading
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,9 +38,6 @@ def run_worker(job: BatchJob, pipe: Connection) -> None:
 
     Sends Stopped instead if it can't continue. Ends when the other end of the pipe is closed, at any moment.
     """
-    # The batch itself handles signals for the whole process group, and kills its workers.
-    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
     units: SimpleQueue[Unit] = SimpleQueue()
     threading.Thread(target=_receive_units, args=(pipe, units), daemon=True).start()
     # The batch has ended if it does not read any more.
