@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,6 +65,17 @@ class BrokenEngines(FakeEngines):
         os._exit(7)
 
 
+@contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file can get larger than this, here and in processes that are started in the block."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+
 def run(*arguments: object, engines: FakeEngines | None = None) -> int:
     """Runs `lanestream batch` in this process, with workers in others, and returns its exit code."""
     code = batch.main([str(each) for each in arguments], obj=engines or FakeEngines(), standalone_mode=False)
@@ -82,6 +98,27 @@ def write_clip(path: Path, frames: int = 3, shade: int | None = None, created: s
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
         container.mux(stream.encode(None))
     return path
+
+
+class Batch:
+    """A batch in a process group of its own, with the smallest real engine."""
+
+    def __init__(self, *arguments: object) -> None:
+        command = [sys.executable, "-m", "lanestream.cli", "batch", *map(str, arguments), *REGRESSION]
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
+
+    def wait_for_files(self, out: Path, number: int) -> None:
+        """Waits until this many units are published, or it has ended."""
+        while self.process.poll() is None and len(list(out.glob("frames/*.jsonl"))) < number:
+            time.sleep(0.005)
+
+    def finish(self) -> tuple[int, str, str]:
+        """Waits until it has ended, and returns its exit code, output and errors."""
+        output, errors = self.process.communicate(timeout=120)
+        assert "Traceback" not in errors, errors
+        return self.process.returncode, output, errors
 
 
 def rows(out: Path) -> dict[tuple[str, int], dict[str, Any]]:

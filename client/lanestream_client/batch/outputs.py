@@ -42,6 +42,8 @@ class _Tables(Protocol):
 
     def close(self) -> None: ...
 
+    def abandon(self) -> None: ...
+
 
 class UnitWriter:
     """Writes the results of a unit's frames to files in the folder `out`."""
@@ -59,6 +61,10 @@ class UnitWriter:
         """Writes what is left. Raises WriteError."""
         with writing(self._out):
             self._tables.close()
+
+    def abandon(self) -> None:
+        """Writes nothing more."""
+        self._tables.abandon()
 
 
 class UnitFiles:
@@ -115,6 +121,9 @@ class JsonLines:
     def close(self) -> None:
         """Does nothing: every line was written at once."""
 
+    def abandon(self) -> None:
+        """Does nothing."""
+
 
 @contextmanager
 def unit_files(out: Path, name: str) -> Iterator[UnitFiles]:
@@ -132,8 +141,12 @@ def unit_writer(files: UnitFiles, out: Path, kind: Format) -> Iterator[UnitWrite
     """Yields the writer of a unit's results, and closes it unless the block fails. Raises WriteError."""
     with writing(out):
         writer = UnitWriter(out, ParquetTables(files.create) if kind == "parquet" else JsonLines(files.create))
-    yield writer
-    writer.close()
+    try:
+        yield writer
+        writer.close()
+    except BaseException:
+        writer.abandon()
+        raise
 
 
 def create_folders(out: Path, kind: Format, tracks: bool) -> None:

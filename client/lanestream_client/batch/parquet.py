@@ -49,6 +49,11 @@ class ParquetTables:
         self._frame_table.close()
         self._lane_table.close()
 
+    def abandon(self) -> None:
+        """Leaves the files without their ends."""
+        # Otherwise pyarrow would write them when it frees the writers.
+        self._frame_table.is_open = self._lane_table.is_open = False
+
     def _write_group(self) -> None:
         import pyarrow as pa
 
