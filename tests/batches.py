@@ -104,7 +104,7 @@ class Batch:
     """A batch in a process group of its own, with the smallest real engine."""
 
     def __init__(self, *arguments: object) -> None:
-        command = [sys.executable, "-m", "lanestream.cli", "batch", *map(str, arguments), *REGRESSION]
+        command = [sys.executable, "-m", "lanestream.cli", "batch", *REGRESSION, *map(str, arguments)]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
         )

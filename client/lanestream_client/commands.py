@@ -25,7 +25,7 @@ from lanestream_client.client import LaneClient
 from lanestream_client.departure_clips import departure_clips
 from lanestream_client.failover import RetryPolicy
 from lanestream_client.frames import CameraSource, SourceCounts, SourceFrame, StreamResult
-from lanestream_client.image_files import image_files, lacks_jpeg_end, read_image_file
+from lanestream_client.image_files import NO_JPEG_END, image_files, lacks_jpeg_end, read_image_file
 from lanestream_client.in_process import InProcessClient
 from lanestream_client.options import Command, LoadEngine, chosen_camera, detection_options, network_options
 from lanestream_client.requests import ServiceInfo
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from lanestream_client.in_process import LaneService, ResultStream
     from lanestream_client.sinks import ResultSink
 
-_NO_END: Final = "the JPEG has no end marker; if it was cut short, its last pixels are missing"
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 
 
@@ -294,7 +293,7 @@ class _StreamRun:
         self.report.write_result(result)
         if not self._warned_of_end and lacks_jpeg_end(result.frame.data or b""):
             self._warned_of_end = True
-            click.echo(f"warning: frame {result.frame.seq}: {_NO_END}", err=True)
+            click.echo(f"warning: frame {result.frame.seq}: {NO_JPEG_END}", err=True)
         if result.error is not None:
             click.echo(f"frame {result.frame.seq}: {result.error.message}", err=True)
         for sink in self._sinks:
@@ -371,7 +370,7 @@ def _detect_file(detect_one: Callable[[bytes], LanesMessage], path: Path) -> Str
         click.echo(f"error: {path}: {error}", err=True)
         return None
     if lacks_jpeg_end(data):
-        click.echo(f"warning: {path}: {_NO_END}", err=True)
+        click.echo(f"warning: {path}: {NO_JPEG_END}", err=True)
     return StreamResult(SourceFrame(0, None, data=data, name=str(path)), lanes=lanes)
 
 

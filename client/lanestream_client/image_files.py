@@ -14,6 +14,7 @@ from lanestream.errors import SourceError, needs_extra
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", ".heic", ".heif")
 _CONVERTED: Final = re.compile(rb"BM|II\*\0|MM\0\*|....ftypavi[fs]", re.DOTALL)
 _JPEG_QUALITY: Final = 95
+NO_JPEG_END: Final = "the JPEG has no end marker; if it was cut short, its last pixels are missing"
 
 
 def image_files(folder: Path, notify: Callable[[str], object] | None = None) -> list[Path]:

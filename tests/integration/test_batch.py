@@ -8,6 +8,7 @@ import signal
 import time
 from pathlib import Path
 
+import click
 import fakes
 import pyarrow.parquet
 import pytest
@@ -152,6 +153,44 @@ def test_broken_files_are_reported_and_tried_again_on_request(
     assert len(rows(out)) == 11 + 1 + 2
 
 
+def test_what_is_wrong_with_files_that_can_be_used_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = tmp_path / "cut.jpg"
+    image.write_bytes(fakes.image_file().removesuffix(b"\xff\xd9"))
+    assert run(image, "--out", tmp_path / "out") == 0
+    assert capsys.readouterr().err == (
+        f"warning: {image}: the JPEG has no end marker; if it was cut short, its last pixels are missing\n"
+    )
+
+
+def test_what_was_seen_along_a_track(archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    write_clip(archive / "timed.mp4", 60, created="2024-05-01T14:00:00Z")
+    (archive / "drives.gpx").write_text(
+        "<gpx><trkpt lat='52' lon='13'><time>2024-05-01T12:00:01Z</time></trkpt>"
+        "<trkpt lat='52' lon='13.1'><time>2024-05-01T12:00:11Z</time></trkpt></gpx>"
+    )
+    camera = ("--camera-height", "1.4", "--field-of-view", "60")
+    assert run(archive, "--out", out, "--gpx", archive / "drives.gpx", "--gpx-offset", "-7200", *camera) == 0
+    (path,) = (out / "geojson").iterdir()
+    assert path.name.startswith("timed.mp4-")
+    (feature,) = json.loads(path.read_text())["features"]
+    assert feature["geometry"]["coordinates"] == [[13.0, 52.0], [13.01, 52.0], [13.0136, 52.0]]
+    assert feature["properties"]["start"] == "2024-05-01T12:00:01.000Z"
+    assert (feature["properties"]["file"], feature["properties"]["frames"]) == (str(archive / "timed.mp4"), 35)
+    assert feature["properties"]["lane_width_m"] == pytest.approx(3.22, abs=0.1)
+    assert {line.partition(" (")[0] for line in capsys.readouterr().err.splitlines()} == {
+        "skipped everything but videos and images (.gpx: 1)".partition(" (")[0],
+        f"warning: {archive / 'one.mp4'}: no positions: the video has no creation time",
+        f"warning: {archive / 'two.mkv'}: no positions: the video has no creation time",
+    }
+    with pytest.raises(BatchError, match=r"gpx_offset was -7200\.0, is 0\.0"):
+        run(archive, "--out", out, "--gpx", archive / "drives.gpx", *camera)
+    with pytest.raises(click.UsageError, match="--gpx-offset needs --gpx"):
+        run(archive, "--out", out, "--gpx-offset", "1")
+
+
 def test_a_worker_that_dies_costs_only_the_file_that_it_was_working_on(
     archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,6 +284,13 @@ def test_names_that_are_not_utf_8(tmp_path: Path) -> None:
     assert summary(tmp_path / "jsonl")["this_run"]["files"] == 0
 
 
+def test_an_unknown_provider_is_reported_in_one_line(archive: Path, tmp_path: Path) -> None:
+    code, _, errors = Batch(archive, "--out", tmp_path / "out", "--provider", "abacus").finish()
+    assert code == 1
+    assert errors.startswith("error: Invalid value for '--provider': 'abacus' is not one of auto, ")
+    assert errors.count("\n") == 1
+
+
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with 200 tiny videos."""
@@ -262,7 +308,7 @@ def test_a_batch_that_is_killed_again_and_again_misses_nothing(clips: Path, tmp_
     assert whole[0] == 0, whole
     out = tmp_path / "out"
     for done, more_s in ((0, 0.3), (1, 0.0), (50, 0.011), (90, 0.023), (140, 0.002)):
-        killed = Batch(clips, "--out", out, "--processes", "3")
+        killed = Batch(clips, "--out", out)
         killed.wait_for_files(out, done)
         time.sleep(more_s)
         killed.process.kill()  # its workers notice and end

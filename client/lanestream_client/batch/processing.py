@@ -29,6 +29,7 @@ from lanestream_client.batch.gpx import Tracks, video_time
 from lanestream_client.batch.outputs import TRACKS, Format, UnitFiles, UnitWriter, unit_files, unit_writer
 from lanestream_client.batch.state import Counts, UnitResult
 from lanestream_client.frames import SourceFrame, StreamResult
+from lanestream_client.image_files import NO_JPEG_END, lacks_jpeg_end, read_image_file
 from lanestream_client.in_process import InProcessClient
 from lanestream_client.video_sources import open_video_file
 
@@ -110,7 +111,7 @@ class UnitProcessor:
         tally = _Tally()
         segments = SegmentLog()
         with unit_writer(files, self._job.out, self._job.format) as writer, _noting_failure(file, failed):
-            self._track_video(file, writer, tally, segments, report)
+            notes += self._track_video(file, writer, tally, segments, report)
         if self._job.tracks is not None and not failed:
             try:
                 self._write_segments(file, self._job.tracks, segments, files)
@@ -122,7 +123,8 @@ class UnitProcessor:
 
     def _track_video(
         self, file: SourceFile, writer: UnitWriter, tally: _Tally, segments: SegmentLog, report: ReportProgress
-    ) -> None:
+    ) -> list[str]:
+        """Writes and counts the results of a video, and returns what was wrong with its frames."""
         job = self._job
         reported = time.monotonic()
         report(0, 0.0)
@@ -144,17 +146,20 @@ class UnitProcessor:
                     reported = time.monotonic()
                     report(0, min(1.0, tally.frames / source.length) if source.length else 0.0)
             tally.add_video(source.fps, source.counts.lost_frames)
+        return [f"{file.path}: {warning.message}" for warning in stream.warnings]
 
     def _process_images(self, unit: Unit, files: UnitFiles, report: ReportProgress) -> UnitResult:
         job = self._job
         failed: dict[str, str] = {}
+        notes: list[str] = []
         tally = _Tally()
         with unit_writer(files, job.out, job.format) as writer:
             for index, file in enumerate(unit.files):
                 report(index, 0.0)
                 with _noting_failure(file, failed):
+                    image = read_image_file(Path(file.path))
                     lanes = self._client.detect(
-                        Path(file.path),
+                        image,
                         horizon=job.horizon,
                         detector=job.detector,
                         camera=job.camera,
@@ -163,7 +168,9 @@ class UnitProcessor:
                     result = StreamResult(SourceFrame(0, None, name=file.path), lanes=lanes)
                     writer.write(file.path, result)
                     tally.add(result)
-        return UnitResult(unit, counts=tally.counts, failed=failed)
+                    if lacks_jpeg_end(image):
+                        notes.append(f"{file.path}: {NO_JPEG_END}")
+        return UnitResult(unit, counts=tally.counts, failed=failed, notes=tuple(notes))
 
     def _write_segments(self, file: SourceFile, tracks: Tracks, segments: SegmentLog, files: UnitFiles) -> None:
         """Raises SourceError if the video has no track, and WriteError."""

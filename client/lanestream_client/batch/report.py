@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _SUMMARY: Final = "summary.json"
 # More are only in summary.json.
 _MOST_LISTED: Final = 20
+# The time that is left follows from the speed in the last minutes.
+_ESTIMATE_S: Final = 300.0
 _RUNS: Final = MappingProxyType({"this_run": "this run", "all_runs": "all runs"})
 # How the table shows the figures.
 _ROWS: Final = MappingProxyType(
@@ -60,7 +62,13 @@ class BatchReport:
             TextColumn("{task.percentage:.1f} %"),
             TimeRemainingColumn(),
         )
-        self._bar = Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
+        self._bar = Progress(
+            *columns,
+            speed_estimate_period=_ESTIMATE_S,
+            console=console,
+            disable=not console.is_terminal,
+            transient=True,
+        )
         self._task = self._bar.add_task(self._status, total=max(total_bytes, 1))
 
     @property
