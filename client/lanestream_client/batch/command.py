@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Any, Final, Protocol, get_args
 
 import click
@@ -22,13 +19,13 @@ from lanestream_client.batch.processing import BatchJob, EngineInfo
 from lanestream_client.batch.ray_runner import RayCluster
 from lanestream_client.batch.report import BatchReport, print_summary, write_summary
 from lanestream_client.batch.state import BatchState, open_state
+from lanestream_client.batch.stopping import StopSignals, stop_signals
 from lanestream_client.batch.units import SourceFile, find_files, units_of
 from lanestream_client.options import chosen_camera, detection_options, network_options
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from contextlib import AbstractContextManager
-    from types import FrameType
 
     from lanestream_client.batch.pool import ReportBytes
     from lanestream_client.batch.state import UnitResult
@@ -141,7 +138,7 @@ def batch(
         kinds=kinds or None,
         tracks=None if gpx is None else find_tracks(gpx.absolute(), gpx_offset or 0.0, notify),
     )
-    with open_state(job.out) as state, _stop_signals() as stop:
+    with open_state(job.out) as state, stop_signals() as stop:
         with _executor(job, processes, ray, stop) as executor:
             failed = _run(job, gpx, state, executor, files, retry_failed)
         if stop.signal is not None:
@@ -196,30 +193,5 @@ def _executor(
     job: BatchJob, processes: int | None, ray: str | None, stop: StopSignals
 ) -> AbstractContextManager[Executor]:
     if ray is not None:
-        return RayCluster(job, ray, processes, stop.received)
+        return RayCluster(job, ray, processes, stop)
     return WorkerPool(job, processes or job.load.most_processes(), stop.received)
-
-
-class StopSignals:
-    """Notes Ctrl-C, SIGTERM and the end of the terminal, so that a batch stops between two steps."""
-
-    def __init__(self) -> None:
-        self.received = Event()
-        self.signal: int | None = None
-
-    def note(self, number: int, _: FrameType | None) -> None:
-        """Notes a signal; the handler of signals."""
-        self.signal = number
-        self.received.set()
-
-
-@contextmanager
-def _stop_signals() -> Iterator[StopSignals]:
-    stop = StopSignals()
-    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, stop.note) for number in numbers}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

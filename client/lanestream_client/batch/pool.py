@@ -16,6 +16,7 @@ from typing import Any, Final, Self
 from lanestream.errors import WorkerLostError
 from lanestream_client.batch.processing import BatchJob, EngineInfo
 from lanestream_client.batch.state import UnitResult
+from lanestream_client.batch.stopping import STOP_SIGNALS
 from lanestream_client.batch.units import Unit
 from lanestream_client.batch.worker import Progress, Stopped, run_worker
 
@@ -219,7 +220,7 @@ def _signals_blocked() -> Iterator[None]:
     """
     # It would unblock signals when it is started together with the first process.
     resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         yield
     finally:

@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import logging
 import pickle
-from collections.abc import Callable, Iterator, Sequence
-from queue import Empty, SimpleQueue
-from threading import Event, Thread
-from typing import TYPE_CHECKING, Any, Final, Self
+import signal
+from collections.abc import Iterator, Sequence
+from threading import Event
+from typing import TYPE_CHECKING, Any, Self
 
 from lanestream.errors import BatchError, LanestreamError, needs_extra, one_line
 from lanestream_client.batch.pool import WorkerPool
 from lanestream_client.batch.processing import BatchJob, EngineInfo, UnitProcessor
 from lanestream_client.batch.state import UnitResult
+from lanestream_client.batch.stopping import STOP_SIGNALS, StopSignals
 from lanestream_client.batch.units import Unit
 from lanestream_client.batch.worker import Stopped
 
 if TYPE_CHECKING:
     from lanestream_client.batch.pool import ReportBytes
-
-_STEP_S: Final = 0.25
 
 
 class RayCluster:
@@ -33,7 +32,7 @@ class RayCluster:
     is no cluster, and MissingExtraError without Ray.
     """
 
-    def __init__(self, job: BatchJob, address: str, processes: int | None, stop: Event) -> None:
+    def __init__(self, job: BatchJob, address: str, processes: int | None, stop: StopSignals) -> None:
         self._job = job
         self._address = address
         self._processes = processes
@@ -43,12 +42,15 @@ class RayCluster:
         with needs_extra("ray"):
             import ray
             import ray.data
+        handlers = {number: signal.getsignal(number) for number in STOP_SIGNALS}
         try:
             ray.init(self._address, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise BatchError(
                 f"no Ray cluster at {self._address}: {one_line(error)}", "give the address that `ray start` printed"
             ) from None
+        for number, handler in handlers.items():  # Ray sets handlers of its own
+            signal.signal(number, handler)
         logging.getLogger("ray.data").setLevel(logging.CRITICAL)
         ray.data.DataContext.get_current().enable_progress_bars = False
         return self
@@ -60,10 +62,7 @@ class RayCluster:
 
     def start(self) -> EngineInfo | None:
         """Returns what runs in the workers; None if it was stopped. Raises the errors of UnitProcessor."""
-        import ray
-
-        info = ray.remote(_describe).remote(self._job)
-        for outcome in self._received(lambda: iter([ray.get(info)])):
+        for outcome in self._received(self._description()):
             assert isinstance(outcome, EngineInfo)  # noqa: S101 - what _describe returns
             return outcome
         return None
@@ -73,10 +72,15 @@ class RayCluster:
 
         Raises WriteError, and WorkerLostError if a machine of the cluster can't start workers.
         """
-        for outcome in self._received(lambda: self._outcomes(units)) if units else ():
+        for outcome in self._received(self._outcomes(units)) if units else ():
             assert isinstance(outcome, UnitResult)  # noqa: S101 - what UnitActor returns
             yield outcome
             report(0.0)
+
+    def _description(self) -> Iterator[EngineInfo | Stopped]:
+        import ray
+
+        yield ray.get(ray.remote(_describe).remote(self._job))
 
     def _outcomes(self, units: Sequence[Unit]) -> Iterator[UnitResult | Stopped]:
         import ray
@@ -91,28 +95,19 @@ class RayCluster:
         for row in outcomes.iter_rows():
             yield pickle.loads(row["outcome"])  # noqa: S301 - from an actor of this batch
 
-    def _received(self, outcomes: Callable[[], Iterator[Any]]) -> Iterator[Any]:
-        """Yields what a thread gets from Ray, whose waits can't be interrupted, until the batch is stopped."""
-        results: SimpleQueue[Any] = SimpleQueue()
-        end = object()
-
-        def read() -> None:
+    def _received(self, outcomes: Iterator[Any]) -> Iterator[Any]:
+        """Yields what Ray gives, until the batch is stopped. Raises the error of a worker that can't continue."""
+        while True:
             try:
-                for outcome in outcomes():
-                    results.put(outcome)
-                results.put(end)
+                with self._stop.interrupting():
+                    outcome = next(outcomes, None)
+            except KeyboardInterrupt:
+                return
             except Exception as error:
-                results.put(Stopped(LanestreamError(f"Ray failed: {type(error).__name__}: {one_line(error)}")))
-
-        Thread(target=read, daemon=True).start()
-        while not self._stop.is_set():
-            try:
-                outcome = results.get(timeout=_STEP_S)
-            except Empty:
-                continue
+                raise LanestreamError(f"Ray failed: {type(error).__name__}: {one_line(error)}") from error
             if isinstance(outcome, Stopped):
                 raise outcome.error
-            if outcome is end:
+            if outcome is None:
                 return
             yield outcome
 
