@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from contextlib import AbstractContextManager
 
-    from lanestream_client.batch.pool import ReportBytes
+    from lanestream_client.batch.pool import ReportUnfinished
     from lanestream_client.batch.state import UnitResult
     from lanestream_client.batch.units import Unit
 
@@ -41,7 +41,7 @@ class Executor(Protocol):
         """Returns what runs in the workers; None if it was stopped."""
         ...
 
-    def run(self, units: Sequence[Unit], report: ReportBytes) -> Iterator[UnitResult]:
+    def run(self, units: Sequence[Unit], report: ReportUnfinished) -> Iterator[UnitResult]:
         """Yields the outcomes of all units as they come, until it is stopped."""
         ...
 

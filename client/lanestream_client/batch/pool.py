@@ -14,11 +14,11 @@ from threading import Event
 from typing import Any, Final, Self
 
 from lanestream.errors import WorkerLostError
-from lanestream_client.batch.processing import BatchJob, EngineInfo
+from lanestream_client.batch.processing import BatchJob, EngineInfo, Progress
 from lanestream_client.batch.state import UnitResult
 from lanestream_client.batch.stopping import STOP_SIGNALS
 from lanestream_client.batch.units import Unit
-from lanestream_client.batch.worker import Progress, Stopped, run_worker
+from lanestream_client.batch.worker import Stopped, run_worker
 
 # How long the pool waits at a time, in seconds. After the batch was suspended, only one such step has passed.
 _STEP_S: Final = 0.25
@@ -30,8 +30,8 @@ _LONGEST_START_S: Final = 900.0
 _MOST_DEATHS: Final = 2
 _MOST_FAILED_STARTS: Final = 3
 
-# Called with the number of bytes of the unfinished units that are done.
-ReportBytes = Callable[[float], object]
+# Called with the number of bytes and frames of the unfinished units that are done.
+ReportUnfinished = Callable[[float, int], object]
 
 
 class WorkerPool:
@@ -73,7 +73,7 @@ class WorkerPool:
                 return message
         return None
 
-    def run(self, units: Sequence[Unit], report: ReportBytes) -> Iterator[UnitResult]:
+    def run(self, units: Sequence[Unit], report: ReportUnfinished) -> Iterator[UnitResult]:
         """Yields the outcomes of all units as they come, until it is stopped.
 
         Raises WriteError if results can't be written, and WorkerLostError if no worker can be started any more.
@@ -89,7 +89,8 @@ class WorkerPool:
                     yield from self._replace(worker, queue)
                 elif isinstance(message, EngineInfo):
                     self._failed_starts = 0
-            report(sum(worker.done_bytes for worker in self._workers))
+            busy = [worker for worker in self._workers if worker.unit is not None]
+            report(sum(worker.done_bytes for worker in busy), sum(worker.progress.frames for worker in busy))
 
     def _assign(self, queue: deque[Unit]) -> None:
         """Gives units to the workers that have none, and starts the workers that are missing."""
@@ -121,7 +122,7 @@ class WorkerPool:
         self._failed_starts += not worker.is_ready
         if worker.unit is None:
             return
-        file = worker.unit.files[worker.index]
+        file = worker.unit.files[worker.progress.index]
         self._deaths[file.path] += 1
         if self._deaths[file.path] < _MOST_DEATHS:
             queue.append(worker.unit)
@@ -147,10 +148,9 @@ class _Worker:
         theirs.close()
         self._hung = False
         self._silent_s = 0.0
-        self._share = 0.0
         self.is_ready = False
         self.unit: Unit | None = None
-        self.index = 0
+        self.progress = Progress()
 
     @property
     def is_idle(self) -> bool:
@@ -162,12 +162,12 @@ class _Worker:
         """The bytes of its unit that are done."""
         if self.unit is None:
             return 0.0
-        done = sum(file.size for file in self.unit.files[: self.index])
-        return done + self._share * self.unit.files[self.index].size
+        done = sum(file.size for file in self.unit.files[: self.progress.index])
+        return done + self.progress.share * self.unit.files[self.progress.index].size
 
     def send(self, unit: Unit) -> None:
         """Gives it a unit."""
-        self.unit, self.index, self._share, self._silent_s = unit, 0, 0.0, 0.0
+        self.unit, self.progress, self._silent_s = unit, Progress(), 0.0
         with suppress(OSError):  # it has ended, which is noticed when it is waited for
             self.pipe.send(unit)
 
@@ -181,7 +181,7 @@ class _Worker:
         if isinstance(message, Stopped):
             raise message.error
         if isinstance(message, Progress):
-            self.index, self._share = message.index, message.share
+            self.progress = message
         else:
             self.is_ready, self.unit = True, None
         return message

@@ -42,8 +42,20 @@ if TYPE_CHECKING:
 # How often progress is reported at most, in seconds.
 _PROGRESS_S: Final = 0.5
 
-# Called with the index of the file within its unit, and the share of it that is done, from 0 to 1.
-ReportProgress = Callable[[int, float], None]
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a unit is: at the file with this `index`, of which this `share` is done, from 0 to 1.
+
+    `frames` counts the frames of the unit that are done.
+    """
+
+    index: int = 0
+    share: float = 0.0
+    frames: int = 0
+
+
+ReportProgress = Callable[[Progress], object]
 
 
 @dataclass(frozen=True)
@@ -127,7 +139,7 @@ class UnitProcessor:
         """Writes and counts the results of a video, and returns what was wrong with its frames."""
         job = self._job
         reported = time.monotonic()
-        report(0, 0.0)
+        report(Progress())
         with open_video_file(file.path, threads=1) as source:
             stream = self._client.stream(
                 source.frames,
@@ -144,7 +156,8 @@ class UnitProcessor:
                     segments.add(result.lanes)
                 if time.monotonic() - reported > _PROGRESS_S:
                     reported = time.monotonic()
-                    report(0, min(1.0, tally.frames / source.length) if source.length else 0.0)
+                    share = min(1.0, tally.frames / source.length) if source.length else 0.0
+                    report(Progress(0, share, tally.frames))
             tally.add_video(source.fps, source.counts.lost_frames)
         return [f"{file.path}: {warning.message}" for warning in stream.warnings]
 
@@ -155,7 +168,7 @@ class UnitProcessor:
         tally = _Tally()
         with unit_writer(files, job.out, job.format) as writer:
             for index, file in enumerate(unit.files):
-                report(index, 0.0)
+                report(Progress(index, 0.0, tally.frames))
                 with _noting_failure(file, failed):
                     image = read_image_file(Path(file.path))
                     lanes = self._client.detect(

@@ -22,7 +22,7 @@ from lanestream_client.batch.units import Unit
 from lanestream_client.batch.worker import Stopped
 
 if TYPE_CHECKING:
-    from lanestream_client.batch.pool import ReportBytes
+    from lanestream_client.batch.pool import ReportUnfinished
 
 
 class RayCluster:
@@ -67,7 +67,7 @@ class RayCluster:
             return outcome
         return None
 
-    def run(self, units: Sequence[Unit], report: ReportBytes) -> Iterator[UnitResult]:
+    def run(self, units: Sequence[Unit], report: ReportUnfinished) -> Iterator[UnitResult]:
         """Yields the outcomes of all units as they come, until it is stopped.
 
         Raises WriteError, and WorkerLostError if a machine of the cluster can't start workers.
@@ -75,7 +75,7 @@ class RayCluster:
         for outcome in self._received(self._outcomes(units)) if units else ():
             assert isinstance(outcome, UnitResult)  # noqa: S101 - what UnitActor returns
             yield outcome
-            report(0.0)
+            report(0.0, 0)
 
     def _description(self) -> Iterator[EngineInfo | Stopped]:
         import ray
@@ -126,7 +126,7 @@ class UnitActor:
         """Yields the rows of the outcomes: a UnitResult each, or Stopped if the worker can't continue."""
         unit: Unit = pickle.loads(row["unit"])  # noqa: S301 - from the batch
         try:
-            for result in self._pool.run([unit], lambda _: None):
+            for result in self._pool.run([unit], lambda *_: None):
                 yield {"outcome": pickle.dumps(result)}
         except LanestreamError as error:
             yield {"outcome": pickle.dumps(Stopped(error))}

@@ -52,6 +52,7 @@ class BatchReport:
         self._started = time.monotonic()
         self._total_files = total_files
         self._finished_bytes = 0.0
+        self._unfinished_frames = 0
         self.counts = Counts()
         self.done = 0
         self.failed = 0
@@ -82,8 +83,9 @@ class BatchReport:
         with self._bar:
             yield
 
-    def show(self, unfinished_bytes: float) -> None:
-        """Shows the progress, including this part of the units that are not finished."""
+    def show(self, unfinished_bytes: float, unfinished_frames: int) -> None:
+        """Shows the progress, including what is done of the units that are not finished."""
+        self._unfinished_frames = unfinished_frames
         self._bar.update(self._task, completed=self._finished_bytes + unfinished_bytes, description=self._status)
 
     def add(self, result: UnitResult) -> None:
@@ -108,7 +110,8 @@ class BatchReport:
     @property
     def _status(self) -> str:
         failed = f", {self.failed} failed" if self.failed else ""
-        return f"{self.done} of {self._total_files} files{failed}, {self._rate:.0f} frames/s"
+        rate = (self.counts.frames + self._unfinished_frames) / max(self.seconds, 1e-9)
+        return f"{self.done} of {self._total_files} files{failed}, {rate:.0f} frames/s"
 
 
 def print_summary(figures: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str], title: str) -> None:

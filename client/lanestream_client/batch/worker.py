@@ -19,14 +19,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """The worker is at the file with this index in its unit, and has done this share of it."""
-
-    index: int
-    share: float
-
-
-@dataclass(frozen=True)
 class Stopped:
     """The worker can't continue, and neither could another one: the engine can't be loaded, or the disk is full."""
 
@@ -46,7 +38,7 @@ def run_worker(job: BatchJob, pipe: Connection) -> None:
             processor = UnitProcessor(job)
             pipe.send(processor.engine_info)
             while True:
-                pipe.send(processor.process(units.get(), lambda index, share: pipe.send(Progress(index, share))))
+                pipe.send(processor.process(units.get(), pipe.send))
         except LanestreamError as error:
             pipe.send(Stopped(error))
         except BrokenPipeError:
