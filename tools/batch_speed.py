@@ -1,8 +1,8 @@
 """`make batch-speed`: how much of what the processors could do `lanestream batch` does, on the same videos.
 
 It is compared with bare engines: one process per processor that decodes the videos and finds their lanes, without
-results, records or progress. Neither counts the time until the first engine is loaded. Both run in every round, so that
-a busy machine slows both, and only ratios within a round count.
+results, records or progress. Neither counts the time until the first engines are loaded. Both run in every round, so
+that a busy machine slows both, and only ratios within a round count.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FPS: Final = 25.0
 @click.command()
 @click.argument("videos", nargs=-1, type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--rounds", type=click.IntRange(1), default=3, show_default=True)
-@click.option("--copies", type=click.IntRange(1), default=8, show_default=True, help="Copies of each video.")
+@click.option("--copies", type=click.IntRange(1), default=16, show_default=True, help="Copies of each video.")
 @click.option("--format", "output_format", type=click.Choice(["jsonl", "parquet"]), default="jsonl", show_default=True)
 def main(videos: tuple[Path, ...], rounds: int, copies: int, output_format: str) -> None:
     """Compare batch with bare engines on copies of VIDEOS  [default: a rendered drive]."""
@@ -64,9 +64,9 @@ def main(videos: tuple[Path, ...], rounds: int, copies: int, output_format: str)
 
 
 def rendered(path: Path) -> Path:
-    """Renders a drive of eight seconds, 1280 x 720."""
+    """Renders a drive of four seconds, 1280 x 720."""
     clip = sample_clip(
-        np.random.default_rng(SEED), 1280, 720, frames=200, fps=FPS, drive=Drive("highway", lane_change=True, fair=True)
+        np.random.default_rng(SEED), 1280, 720, frames=100, fps=FPS, drive=Drive("highway", lane_change=True, fair=True)
     )
     with video_sink(path, FPS) as sink:
         assert sink is not None  # noqa: S101 - has a path

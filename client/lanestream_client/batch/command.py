@@ -139,7 +139,7 @@ def batch(
         tracks=None if gpx is None else find_tracks(gpx.absolute(), gpx_offset or 0.0, notify),
     )
     with open_state(job.out) as state, stop_signals() as stop:
-        with _executor(job, processes, ray, stop) as executor:
+        with _executor(job, len(files), processes, ray, stop) as executor:
             failed = _run(job, gpx, state, executor, files, retry_failed)
         if stop.signal is not None:
             click.echo("stopped; the same command continues", err=True)
@@ -190,8 +190,8 @@ def _settings(job: BatchJob, gpx: Path | None, info: EngineInfo) -> dict[str, An
 
 
 def _executor(
-    job: BatchJob, processes: int | None, ray: str | None, stop: StopSignals
+    job: BatchJob, files: int, processes: int | None, ray: str | None, stop: StopSignals
 ) -> AbstractContextManager[Executor]:
     if ray is not None:
         return RayCluster(job, ray, processes, stop)
-    return WorkerPool(job, processes or job.load.most_processes(), stop.received)
+    return WorkerPool(job, min(processes or job.load.most_processes(), files), stop.received)

@@ -56,14 +56,13 @@ class WorkerPool:
             worker.kill()
 
     def start(self) -> EngineInfo | None:
-        """Starts the first worker and returns what runs in it; None if it was stopped.
+        """Starts the workers and returns what runs in the first that is ready; None if it was stopped.
 
-        Raises the errors of UnitProcessor, and WorkerLostError if the worker dies.
+        Raises the errors of UnitProcessor, and WorkerLostError if a worker dies before.
         """
-        worker = _Worker(self._job)
-        self._workers.append(worker)
+        self._workers = [_Worker(self._job) for _ in range(self._processes)]
         while not self._stop.is_set():
-            if self._wait():
+            for worker in self._wait():
                 message = worker.receive()
                 if not isinstance(message, EngineInfo):
                     raise WorkerLostError(

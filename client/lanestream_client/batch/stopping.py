@@ -43,9 +43,10 @@ class StopSignals:
 
 @contextmanager
 def stop_signals() -> Iterator[StopSignals]:
-    """Notes signals during the block, instead of being ended by them."""
+    """Notes signals during the block, instead of being ended by them. Ignored ones stay ignored, as `nohup` wants."""
     stop = StopSignals()
-    before = {number: signal.signal(number, stop.note) for number in STOP_SIGNALS}
+    heard = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, stop.note) for number in heard}
     try:
         yield stop
     finally:
