@@ -83,6 +83,7 @@ class WorkerPool:
             for worker in self._wait():
                 message = worker.receive()
                 if isinstance(message, UnitResult):
+                    self._assign(queue)  # before the caller takes its time to record the outcome
                     yield message
                 elif message is None:
                     yield from self._replace(worker, queue)

@@ -9,9 +9,10 @@ from __future__ import annotations
 import logging
 import pickle
 import signal
+import socket
 from collections.abc import Iterator, Sequence
 from threading import Event
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from lanestream.errors import BatchError, LanestreamError, needs_extra, one_line
 from lanestream_client.batch.pool import WorkerPool
@@ -23,6 +24,8 @@ from lanestream_client.batch.worker import Stopped
 
 if TYPE_CHECKING:
     from lanestream_client.batch.pool import ReportUnfinished
+
+_CONNECT_S: Final = 10.0
 
 
 class RayCluster:
@@ -44,8 +47,10 @@ class RayCluster:
             import ray.data
         handlers = {number: signal.getsignal(number) for number in STOP_SIGNALS}
         try:
-            ray.init(self._address, log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, RuntimeError, ValueError) as error:
+            _check_reachable(self._address)
+            with self._stop.interrupting():
+                ray.init(self._address, log_to_driver=False, logging_level=logging.ERROR)
+        except (OSError, OverflowError, RuntimeError, ValueError) as error:
             raise BatchError(
                 f"no Ray cluster at {self._address}: {one_line(error)}", "give the address that `ray start` printed"
             ) from None
@@ -130,6 +135,13 @@ class UnitActor:
                 yield {"outcome": pickle.dumps(result)}
         except LanestreamError as error:
             yield {"outcome": pickle.dumps(Stopped(error))}
+
+
+def _check_reachable(address: str) -> None:
+    """Raises OSError if nothing listens at an address with a port, for which Ray itself would wait for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
 
 
 def _describe(job: BatchJob) -> EngineInfo | Stopped:
