@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: attack batch-ray batch-speed bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: attack batch-ray batch-speed bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -46,6 +46,10 @@ MODELS := service/lanestream/models
 
 DATA ?= ../shared/data
 
+# The names and the version of the shipped models.
+AS_REGRESSOR := --name lanestream-regressor --version $(VERSION)
+AS_CLASSIFIER := --name lanestream-alexnet --version $(VERSION)
+
 # Trains networks like the shipped ones and writes them to out/. Takes hours on a CPU; continues after an interruption.
 models: export LANESTREAM_DATA = $(DATA)
 models: $(DEV_READY)
@@ -55,11 +59,12 @@ models: $(DEV_READY)
 	$(BIN)/lanestream train classifier --run runs/classifier
 	$(BIN)/lanestream export runs/classifier/best.pt out/classifier-first.onnx --regressor out/regressor-first.onnx
 	$(BIN)/lanestream train regressor regressor-second --run runs/regressor-second --frames runs/regressor/frames
-	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx
+	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx $(AS_REGRESSOR)
 	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx --regressor out/regressor.onnx
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx --precision fp32 \
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx $(AS_CLASSIFIER) \
 	  --regressor out/regressor.onnx
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx $(AS_CLASSIFIER) \
+	  --precision fp32 --regressor out/regressor.onnx
 	$(BIN)/lanestream train checkpoint runs/regressor-second/best.pt out/regressor.pt
 	$(BIN)/lanestream train checkpoint runs/classifier-second/best.pt out/classifier.pt
 
@@ -96,6 +101,10 @@ attack: $(DEV_READY)
 asyncapi: $(DEV_READY)
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml
 
+# Updates what the Helm chart repeats: the version, the alerts, and the names and types of settings.
+chart: $(DEV_READY)
+	$(BIN)/python tools/chart.py
+
 # Needs npm: the schema of AsyncAPI documents is published only there.
 asyncapi-check: $(DEV_READY)
 	npm install --silent --no-audit --no-fund --prefix out/asyncapi @asyncapi/specs@6
@@ -121,12 +130,16 @@ BUILD_REQUIREMENTS := import tomllib; print(*tomllib.load(open("pyproject.toml",
 # Locks the packages of the images, and those that build our own: the newest versions that pyproject.toml allows.
 lock: | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster -o docker/requirements-cpu.txt pyproject.toml
-	$(LOCK) --extra service --extra gpu --extra cluster -o docker/requirements-gpu.txt pyproject.toml
+	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster --extra tracing -o docker/requirements-cpu.txt pyproject.toml
+	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
+
+# Fails if a line in it is not a lane boundary of its scene.
+moving-picture: $(DEV_READY)
+	$(BIN)/python tools/moving_picture.py docs/lanes.webp
 
 # Podman's own image format can't store a health check.
 image:
@@ -141,8 +154,8 @@ COMPOSE = $(ENGINE) compose -f docker/compose.yaml --profile $(VARIANT)
 up: image
 	docker/make-secrets $(ENGINE) run --rm lanestream:$(VARIANT)
 	$(COMPOSE) up --detach --wait
-	@echo 'service: http://127.0.0.1:8000, key in docker/secrets/local_key'
-	@echo 'dashboard: http://127.0.0.1:3000, user admin, password in docker/secrets/grafana_password'
+	@echo "service: http://$${LANESTREAM_PUBLISH:-127.0.0.1:8000}, key in docker/secrets/local_key"
+	@echo "dashboard: http://$${GRAFANA_PUBLISH:-127.0.0.1:3000}, user admin, password in docker/secrets/grafana_password"
 
 down:
 	$(COMPOSE) down

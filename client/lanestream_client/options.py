@@ -45,12 +45,17 @@ def network_options(command: Command) -> Command:
     """Adds the options that choose the networks of this process and where they run."""
     return _with_options(
         command,
-        click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network to run in process."),
+        click.option(
+            "--model",
+            type=click.Path(path_type=Path),
+            metavar="FILE|shipped",
+            help="ONNX file of the network to run in process  [default: shipped]",
+        ),
         click.option(
             "--regressor",
             type=click.Path(path_type=Path),
-            metavar="FILE|none",
-            help="ONNX file of the regressor to run in process, or none  [default: the built-in one]",
+            metavar="FILE|shipped|none",
+            help="ONNX file of the regressor to run in process  [default: shipped]",
         ),
         click.option(
             "--provider",

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import tomllib
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
@@ -21,7 +22,7 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from lanestream.errors import SettingsError
+from lanestream.errors import SettingsError, one_line
 from lanestream.host import memory, network_threads, processors
 from lanestream.images.decoding import MOST_PIXELS, ImageLimits
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES, RuntimeOptions
@@ -35,6 +36,12 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 _PREFIX: Final = "LANESTREAM_"
+# Variables of other programs: the client's key, the data for training, what compose.yaml publishes.
+_OTHER_VARIABLES: Final = frozenset({"LANESTREAM_API_KEY", "LANESTREAM_DATA", "LANESTREAM_PUBLISH"})
+# What Kubernetes sets for Services named "lanestream" or "lanestream-...", with its value.
+_KUBERNETES_VARIABLE: Final = re.compile(
+    r"LANESTREAM_(\w+_)?(SERVICE_(HOST|PORT\w*)|PORT_\d+_\w+)=.*|LANESTREAM_\w+_PORT=(tcp|udp|sctp)://.*", re.DOTALL
+)
 _ORIGIN: Final = re.compile(r"[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 _MASK: Final = "***"
 _MOST_BUFFERED_BYTES: Final = 256 << 20
@@ -104,9 +111,9 @@ class Settings(BaseSettings):
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 selects a free one.")
-    model: Path | None = Field(default=None, description="ONNX file of the network; the shipped one if not set.")
+    model: Path | None = Field(default=None, description="ONNX file of the network, or `shipped`, the default.")
     regressor: Path | None = Field(
-        default=None, description="ONNX file of the regressor, or `none`; the shipped one if not set."
+        default=None, description="ONNX file of the regressor, `shipped`, the default, or `none`."
     )
     provider: Annotated[str, AfterValidator(_provider)] = Field(
         default=AUTO, description="Execution provider of the networks."
@@ -231,9 +238,19 @@ class Settings(BaseSettings):
         description="API keys as printed by `lanestream key NAME`, NAME:SHA256; without any, every caller is accepted.",
     )
     api_keys_file: Path | None = Field(default=None, description="File with further API keys, one per line.")
+    token_secret: SecretStr | None = Field(
+        default=None,
+        min_length=32,
+        description="Secret of at least 32 characters that signs access tokens, the same on all replicas; if not set, "
+        "a random one, so that tokens are valid only for this process.",
+    )
+    token_s: float = Field(
+        default=600.0, ge=10.0, le=3600.0, description="Access tokens for web pages expire after this many seconds."
+    )
     allowed_origins: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)] = Field(
         default=(), description="Origins of other web pages that may use the service, such as https://example.com."
     )
+    live_page: bool = Field(default=True, description="Serve the live page at `/`.")
     metrics_access: Literal["keys", "open", "off"] = Field(
         default="keys", description="Who may read /metrics: `keys` callers with a key, `open` everyone, `off` no one."
     )
@@ -328,6 +345,7 @@ def load_settings(**options: object) -> Settings:
 
     Raises SettingsError on one line that names the option, the variable or the key in the file, and shows no secret.
     """
+    _check_variables()
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     config = given.get("config") or os.environ.get(f"{_PREFIX}CONFIG")
     path = None if config is None or config == "" else Path(str(config))
@@ -359,6 +377,34 @@ def load_settings(**options: object) -> Settings:
     return settings
 
 
+def _check_variables() -> None:
+    """Raises SettingsError if an environment variable has the prefix of the settings and is not one of them."""
+    for variable, value in os.environ.items():
+        full_name = variable.upper()
+        name = full_name.removeprefix(_PREFIX).lower()
+        if name in Settings.model_fields or full_name in _OTHER_VARIABLES or not full_name.startswith(_PREFIX):
+            continue
+        if not _KUBERNETES_VARIABLE.fullmatch(f"{variable}={value}"):
+            nearest = _nearest_setting(name)
+            raise _unknown_setting(
+                f"the environment variable {one_line(variable, 80)}", nearest and _PREFIX + nearest.upper()
+            )
+    if os.environ.get("LANESTREAM_PORT", "").startswith("tcp://"):
+        raise SettingsError(
+            "LANESTREAM_PORT is the address that Kubernetes sets for a Service named lanestream",
+            "set enableServiceLinks: false for the pod, or give the Service another name",
+        )
+
+
+def _nearest_setting(name: str) -> str | None:
+    return next(iter(get_close_matches(name, Settings.model_fields, n=1)), None)
+
+
+def _unknown_setting(label: str, nearest: str | None) -> SettingsError:
+    hint = f"did you mean {nearest}? " if nearest else ""
+    return SettingsError(f"{label} is not a setting", f"{hint}`lanestream serve --print-config` lists all settings")
+
+
 def to_toml(settings: Settings) -> str:
     """Returns the settings as TOML, one per line, with secrets masked. Settings without a value are comments."""
     lines = (_toml_line(name, getattr(settings, name)) for name in type(settings).model_fields)
@@ -387,7 +433,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 def _settings_error(label: str, problem: ErrorDetails) -> SettingsError:
     if problem["type"] == "extra_forbidden":
-        return SettingsError(f"{label} is not a setting", "`lanestream serve --print-config` lists all settings")
+        return _unknown_setting(label, _nearest_setting(str(problem["loc"][0])))
     message = _lower_first(problem["msg"].removeprefix("Value error, "))
     return SettingsError(f"{label}{_input(problem)}: {message}")
 

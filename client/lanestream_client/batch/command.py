@@ -129,9 +129,9 @@ def batch(
         out=out.absolute(),
         format=output_format,
         load=context.obj,
-        model=model and model.absolute(),
+        model=_absolute(model),
         provider=provider,
-        regressor=regressor if regressor in (None, Path("none")) else regressor.absolute(),
+        regressor=_absolute(regressor),
         detector=detector,
         horizon=horizon,
         camera=chosen_camera(camera_file, camera_height, field_of_view),
@@ -187,6 +187,11 @@ def _settings(job: BatchJob, gpx: Path | None, info: EngineInfo) -> dict[str, An
         "gpx": None if gpx is None else str(gpx.absolute()),
         "gpx_offset": None if job.tracks is None else job.tracks.offset_s,
     }
+
+
+def _absolute(model: Path | None) -> Path | None:
+    """Returns the absolute path of a model file, for other machines. The words `shipped` and `none` are not paths."""
+    return model if model in (None, Path("shipped"), Path("none")) else model.absolute()
 
 
 def _executor(

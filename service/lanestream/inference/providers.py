@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from lanestream.errors import ProviderError, needs_whole_packages
+from lanestream.errors import ProviderError, needs_extra
 from lanestream.host import instruction_sets
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ class Installed:
 
     @classmethod
     def here(cls) -> Installed:
-        """Returns what is installed on this machine. Raises MissingExtraError if onnxruntime is not complete."""
-        with needs_whole_packages():
+        """Returns what is installed on this machine. Raises MissingExtraError if onnxruntime is missing or broken."""
+        with needs_extra("cpu"):
             onnxruntime = frozenset(import_module("onnxruntime").get_available_providers())
         return cls(
             onnxruntime=onnxruntime,
