@@ -46,7 +46,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
         return int(caught.value.code or 0), output, errors
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider, regressor: LocalEngine(load(regressor)))
+    monkeypatch.setattr(
+        LocalEngine, "load", lambda _model, _provider, regressor, _threads: LocalEngine(load(regressor))
+    )
     return call
 
 
@@ -72,7 +74,20 @@ def test_help_needs_no_extra() -> None:
     shown = subprocess.run(
         [sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True, timeout=30
     )
-    for name in ("serve", "key", "doctor", "detect", "stream", "scene", "data", "train", "export", "evaluate", "score"):
+    for name in (
+        "serve",
+        "key",
+        "doctor",
+        "batch",
+        "detect",
+        "stream",
+        "scene",
+        "data",
+        "train",
+        "export",
+        "evaluate",
+        "score",
+    ):
         assert re.search(rf"^  {name}  +[A-Z].+\.$", shown.stdout, re.MULTILINE), f"{name} has a line of help"
     for arguments in (["detect", "x.jpg"], ["scene", "x.mp4"], ["doctor"], ["serve"]):
         refused = subprocess.run(

@@ -92,6 +92,7 @@ def test_every_command_has_help(hidden: list[str]) -> None:
         ("scene x.mp4", "video"),
         ("calibrate x --height 1.4 -o camera.json", "service,cpu"),
         ("data check x", "data"),
+        ("label x out --format cvat", "data,service,cpu"),
         ("train classifier --run x", "train,service,cpu"),
         ("export x.pt x.onnx", "export,service,cpu"),
         ("evaluate", "export,service,cpu"),
