@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: docs docs-serve attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -116,6 +116,13 @@ lock: | $(VENV)/bin/python
 	$(LOCK) --extra service --extra gpu --extra cluster -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
+docs docs-serve: export NO_MKDOCS_2_WARNING = 1
+docs: $(DEV_READY)
+	$(BIN)/mkdocs build
+
+docs-serve: $(DEV_READY)
+	$(BIN)/mkdocs serve
+
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
 
@@ -151,5 +158,5 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,docs,dev]'
 	@touch $@ $(RUN_READY)

@@ -91,6 +91,18 @@ def test_the_tables_of_results_are_complete() -> None:
     assert described == events
 
 
+def test_every_field_is_described() -> None:
+    fields = {
+        f"{name}.{field}": schema
+        for name, message in document()["components"]["schemas"].items()
+        for field, schema in message["properties"].items()
+    }
+    parts = {name: [schema, *schema.get("anyOf", [])] for name, schema in fields.items() if not name.endswith(".type")}
+    assert [
+        name for name, found in parts.items() if not any({"description", "$ref"} & set(each) for each in found)
+    ] == []
+
+
 def test_the_tables_of_warnings_and_departures_are_complete() -> None:
     warnings = {code: meaning.split(";")[0] for code, (meaning,) in rows("| code | |").items()}
     assert warnings == {code: message for code, (message, _) in WARNINGS.items()}
