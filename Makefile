@@ -112,8 +112,8 @@ BUILD_REQUIREMENTS := import tomllib; print(*tomllib.load(open("pyproject.toml",
 # Locks the packages of the images, and those that build our own: the newest versions that pyproject.toml allows.
 lock: | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster -o docker/requirements-cpu.txt pyproject.toml
-	$(LOCK) --extra service --extra gpu --extra cluster -o docker/requirements-gpu.txt pyproject.toml
+	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster --extra tracing -o docker/requirements-cpu.txt pyproject.toml
+	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
 docs docs-serve: export NO_MKDOCS_2_WARNING = 1
@@ -139,8 +139,8 @@ COMPOSE = $(ENGINE) compose -f docker/compose.yaml --profile $(VARIANT)
 up: image
 	docker/make-secrets $(ENGINE) run --rm lanestream:$(VARIANT)
 	$(COMPOSE) up --detach --wait
-	@echo 'service: http://127.0.0.1:8000, key in docker/secrets/local_key'
-	@echo 'dashboard: http://127.0.0.1:3000, user admin, password in docker/secrets/grafana_password'
+	@echo "service: http://$${LANESTREAM_PUBLISH:-127.0.0.1:8000}, key in docker/secrets/local_key"
+	@echo "dashboard: http://$${GRAFANA_PUBLISH:-127.0.0.1:3000}, user admin, password in docker/secrets/grafana_password"
 
 down:
 	$(COMPOSE) down

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import webbrowser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -118,8 +119,9 @@ def cli(context: click.Context) -> None:
 @click.option(
     "--log-level", type=click.Choice(["debug", "info", "warning", "error"]), help="Log level  [default: info]"
 )
+@click.option("--open", "open_page", is_flag=True, help="Open the live page in a browser once the service is ready.")
 @click.option("--print-config", is_flag=True, help="Print all settings with secrets masked, and exit.")
-def serve(*, print_config: bool, **options: Any) -> None:
+def serve(*, open_page: bool, print_config: bool, **options: Any) -> None:
     """Serve lanes over HTTP and WebSockets.
 
     Every setting can also be given as LANESTREAM_<NAME>, or in the file of --config. --print-config lists them all.
@@ -135,9 +137,11 @@ def serve(*, print_config: bool, **options: Any) -> None:
     if print_config:
         click.echo(to_toml(settings))
         return
+    if open_page and not settings.live_page:
+        raise click.UsageError("--open needs the live page: set LANESTREAM_LIVE_PAGE to true")
     regressor = resolve_regressor(settings.regressor)
     load = partial(load_engine, settings.model, settings.provider, regressor, settings.runtime_options)
-    run(settings, load, draw_lanes)
+    run(settings, load, draw_lanes, _open_in_browser if open_page else None)
 
 
 @cli.command()
@@ -179,6 +183,11 @@ def main() -> None:
     except click.Abort:
         code = _EXIT_INTERRUPTED
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _open_in_browser(url: str) -> None:
+    if not webbrowser.open(url):
+        click.echo(f"no browser was found: open {url} in one", err=True)
 
 
 def _terminate(*_: object) -> None:

@@ -1,7 +1,8 @@
 """The service's logging: one handler for all loggers, as text or JSON lines, without secrets.
 
 Logging never waits for whoever reads standard error: see BackgroundHandler. Records about a session or a frame name it
-with `extra={"session": ..., "seq": ...}`.
+with `extra={"session": ..., "seq": ...}`. Records that programs may look for also have an `event` and its values there:
+they are fields in JSON, and the message says the same to people.
 """
 
 from __future__ import annotations
@@ -153,6 +154,13 @@ class JsonLogFormatter(JsonFormatter):
             timestamp=_TIME,
             reserved_attrs=[*RESERVED_ATTRS, *_LIBRARY_FIELDS],
         )
+
+    def add_fields(self, log_data: dict[str, Any], record: logging.LogRecord, message_dict: dict[str, Any]) -> None:
+        """Adds the parts of a line of uvicorn's access log as fields."""
+        super().add_fields(log_data, record, message_dict)
+        if record.name == _ACCESS and isinstance(record.args, tuple) and len(record.args) == _ACCESS_ARGUMENTS:
+            address, method, path, _, status = record.args
+            log_data |= {"event": "request", "address": address, "method": method, "path": path, "status": status}
 
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
         """Returns the record without empty fields."""

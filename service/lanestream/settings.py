@@ -9,6 +9,7 @@ import json
 import os
 import re
 import tomllib
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
@@ -21,7 +22,7 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from lanestream.errors import SettingsError
+from lanestream.errors import SettingsError, one_line
 from lanestream.host import memory, network_threads, processors
 from lanestream.images.decoding import MOST_PIXELS, ImageLimits
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES, RuntimeOptions
@@ -35,6 +36,10 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 _PREFIX: Final = "LANESTREAM_"
+# Variables of other programs: the client's key, the data for training, what compose.yaml publishes.
+_OTHER_VARIABLES: Final = frozenset({"LANESTREAM_API_KEY", "LANESTREAM_DATA", "LANESTREAM_PUBLISH"})
+# What Kubernetes sets for a Service named "lanestream".
+_KUBERNETES_VARIABLE: Final = re.compile(r"LANESTREAM_(SERVICE_(HOST|PORT.*)|PORT_\d+_.*)")
 _ORIGIN: Final = re.compile(r"[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 _MASK: Final = "***"
 _MOST_BUFFERED_BYTES: Final = 256 << 20
@@ -231,9 +236,19 @@ class Settings(BaseSettings):
         description="API keys as printed by `lanestream key NAME`, NAME:SHA256; without any, every caller is accepted.",
     )
     api_keys_file: Path | None = Field(default=None, description="File with further API keys, one per line.")
+    token_secret: SecretStr | None = Field(
+        default=None,
+        min_length=32,
+        description="Secret of at least 32 characters that signs access tokens, the same on all replicas; if not set, "
+        "a random one, so that tokens are valid only for this process.",
+    )
+    token_s: float = Field(
+        default=600.0, ge=10.0, le=3600.0, description="Access tokens for web pages expire after this many seconds."
+    )
     allowed_origins: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_origins)] = Field(
         default=(), description="Origins of other web pages that may use the service, such as https://example.com."
     )
+    live_page: bool = Field(default=True, description="Serve the live page at `/`.")
     metrics_access: Literal["keys", "open", "off"] = Field(
         default="keys", description="Who may read /metrics: `keys` callers with a key, `open` everyone, `off` no one."
     )
@@ -328,6 +343,7 @@ def load_settings(**options: object) -> Settings:
 
     Raises SettingsError on one line that names the option, the variable or the key in the file, and shows no secret.
     """
+    _check_variables()
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     config = given.get("config") or os.environ.get(f"{_PREFIX}CONFIG")
     path = None if config is None or config == "" else Path(str(config))
@@ -359,6 +375,34 @@ def load_settings(**options: object) -> Settings:
     return settings
 
 
+def _check_variables() -> None:
+    """Raises SettingsError if an environment variable has the prefix of the settings and is not one of them."""
+    for variable in os.environ:
+        full_name = variable.upper()
+        name = full_name.removeprefix(_PREFIX).lower()
+        if name in Settings.model_fields or full_name in _OTHER_VARIABLES or not full_name.startswith(_PREFIX):
+            continue
+        if not _KUBERNETES_VARIABLE.fullmatch(variable):
+            nearest = _nearest_setting(name)
+            raise _unknown_setting(
+                f"the environment variable {one_line(variable, 80)}", nearest and _PREFIX + nearest.upper()
+            )
+    if os.environ.get("LANESTREAM_PORT", "").startswith("tcp://"):
+        raise SettingsError(
+            "LANESTREAM_PORT is the address that Kubernetes sets for a Service named lanestream",
+            "set enableServiceLinks: false for the pod, or give the Service another name",
+        )
+
+
+def _nearest_setting(name: str) -> str | None:
+    return next(iter(get_close_matches(name, Settings.model_fields, n=1)), None)
+
+
+def _unknown_setting(label: str, nearest: str | None) -> SettingsError:
+    hint = f"did you mean {nearest}? " if nearest else ""
+    return SettingsError(f"{label} is not a setting", f"{hint}`lanestream serve --print-config` lists all settings")
+
+
 def to_toml(settings: Settings) -> str:
     """Returns the settings as TOML, one per line, with secrets masked. Settings without a value are comments."""
     lines = (_toml_line(name, getattr(settings, name)) for name in type(settings).model_fields)
@@ -387,7 +431,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 def _settings_error(label: str, problem: ErrorDetails) -> SettingsError:
     if problem["type"] == "extra_forbidden":
-        return SettingsError(f"{label} is not a setting", "`lanestream serve --print-config` lists all settings")
+        return _unknown_setting(label, _nearest_setting(str(problem["loc"][0])))
     message = _lower_first(problem["msg"].removeprefix("Value error, "))
     return SettingsError(f"{label}{_input(problem)}: {message}")
 

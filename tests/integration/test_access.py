@@ -7,12 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import fakes
 import httpx
+import jwt
 import pytest
 from fastapi.routing import APIRoute
 from websockets.exceptions import InvalidStatus
@@ -250,6 +252,92 @@ def test_the_key_command_creates_valid_keys(serve: Serve) -> None:
     assert httpx.get(f"{url}/v1/models", headers=bearer(token)).status_code == 200
 
 
+SECRET = "signs tokens " * 4
+PAGE = {"origin": LISTED}
+
+
+def issue(url: str, credential: str) -> httpx.Response:
+    return httpx.post(f"{url}/v1/tokens", headers=bearer(credential))
+
+
+def test_a_token_is_used_like_the_key_it_was_issued_for(guarded: str) -> None:
+    response = issue(guarded, TOKEN)
+    assert (response.status_code, response.json()["expires_s"]) == (200, 600.0)
+    token = response.json()["token"]
+    assert httpx.get(f"{guarded}/v1/models", headers={**bearer(token), **PAGE}).status_code == 200
+    assert send_frame(guarded, subprotocols=["lanestream.v1", f"bearer.{token}"], origin=LISTED) == "lanestream.v1"
+
+
+def test_a_token_counts_as_the_caller_of_its_key(guarded: str) -> None:
+    token = issue(guarded, TOKEN).json()["token"]
+    stream_url = f"{guarded.replace('http', 'ws')}/v1/stream"
+    with connect(stream_url, additional_headers=bearer(TOKEN)) as socket:
+        resume_token = start(socket)["resume_token"]
+    for credential, resumed in ((OTHER_TOKEN, False), (token, True)):
+        with connect(stream_url, additional_headers=bearer(credential)) as socket:
+            assert start(socket, resume_token=resume_token)["resumed"] is resumed
+
+
+def test_only_a_key_is_exchanged_for_a_token(guarded: str, url: str) -> None:
+    token = issue(guarded, TOKEN).json()["token"]
+    for credential in (token, TOKEN + "x", KEY.digest):
+        assert (issue(guarded, credential).status_code, issue(guarded, credential).json()["code"]) == (
+            401,
+            "unauthorized",
+        )
+    assert httpx.post(f"{guarded}/v1/tokens").status_code == 401
+    assert httpx.post(f"{guarded}/v1/tokens", headers={**bearer(TOKEN), "origin": FOREIGN}).status_code == 403
+    assert issue(url, TOKEN).json()["message"] == "this service requires no API key"
+
+
+def test_forged_and_expired_tokens_are_refused(serve: Serve) -> None:
+    url = serve(fakes.engine(), api_keys=str(KEY), token_secret=SECRET)
+    now = int(time.time())
+    valid = {"sub": KEY.name, "exp": now + 60}
+    refused = [
+        jwt.encode(valid, SECRET + "x", "HS256"),
+        jwt.encode(valid, SECRET, "HS384"),
+        jwt.encode(valid, None, "none"),
+        jwt.encode({"sub": KEY.name}, SECRET, "HS256"),
+        jwt.encode({"exp": now + 60}, SECRET, "HS256"),
+        jwt.encode({**valid, "sub": "a-removed-key"}, SECRET, "HS256"),
+    ]
+    expired = jwt.encode({**valid, "exp": now - 60}, SECRET, "HS256")
+    assert httpx.get(f"{url}/v1/models", headers=bearer(jwt.encode(valid, SECRET, "HS256"))).status_code == 200
+    for token in (*refused, expired):
+        response = httpx.get(f"{url}/v1/models", headers=bearer(token))
+        assert (response.status_code, response.json()["code"]) == (401, "unauthorized"), token
+        assert ("expired" in response.json()["message"]) == (token == expired)
+
+
+def test_replicas_with_the_same_secret_accept_each_others_tokens(serve: Serve) -> None:
+    def accepts(url: str, token: str) -> bool:
+        return httpx.get(f"{url}/v1/models", headers=bearer(token)).status_code == 200
+
+    settings = {"api_keys": str(KEY), "token_secret": SECRET}
+    one, other, alone = (serve(fakes.engine(), **fields) for fields in (settings, settings, {"api_keys": str(KEY)}))
+    token = issue(one, TOKEN).json()["token"]
+    assert [accepts(url, token) for url in (one, other, alone)] == [True, True, False]
+    own = issue(alone, TOKEN).json()["token"]
+    assert [accepts(url, own) for url in (one, other, alone)] == [False, False, True]
+
+
+def test_a_page_can_ask_why_its_handshake_fails(guarded: str, url: str, serve: Serve) -> None:
+    def ask(base: str, headers: dict[str, str] | None = None, **query: str) -> tuple[int, str]:
+        response = httpx.get(f"{base}/v1/stream", headers=headers, params=query)
+        return response.status_code, response.json()["code"]
+
+    assert ask(url) == (426, "upgrade_required")
+    assert ask(guarded, bearer(TOKEN), origin=LISTED) == (426, "upgrade_required")
+    assert ask(guarded, bearer(TOKEN + "x")) == (401, "unauthorized")
+    assert ask(guarded) == (401, "unauthorized")
+    assert ask(guarded, bearer(TOKEN), origin=FOREIGN) == (403, "forbidden")
+    # A browser sends no origin with a GET to the page's own site, though it sends one with a handshake.
+    assert ask(url, {"host": "lanes.test"}, origin="http://lanes.test") == (403, "forbidden")
+    assert ask(serve(None)) == (503, "not_ready")
+    assert httpx.get(f"{url}/v1/stream").headers["upgrade"] == "websocket"
+
+
 def _with_key(token: str, *, in_header: bool) -> dict[str, Any]:
     return (
         {"additional_headers": bearer(token)} if in_header else {"subprotocols": ["lanestream.v1", f"bearer.{token}"]}
@@ -349,6 +437,15 @@ def test_keys_are_never_logged() -> None:
     assert "camera-7" in messages
     for secret in (TOKEN, KEY.digest, wrong):
         assert secret not in "".join(lines)
+    by_event = {record["event"]: record for record in records if "event" in record}
+    assert by_event.keys() == {"listening", "detector_loaded", "ready", "request", "stream_opened", "stream_closed"}
+    assert by_event["stream_opened"]["caller"] == "camera-7"
+    assert by_event["stream_closed"]["session"] == by_event["stream_opened"]["session"]
+    assert {name: by_event["stream_closed"][name] for name in ("frames", "answered", "dropped")} == {
+        "frames": 1,
+        "answered": 1,
+        "dropped": 0,
+    }
 
 
 def test_a_service_without_keys_logs_a_warning() -> None:

@@ -74,7 +74,7 @@ def test_every_response_to_an_image_is_documented(both_url: str) -> None:
     statuses: set[int] = set()
 
     @given(data=st.data(), body=st.sampled_from(BODIES), accept=st.sampled_from(ACCEPT_HEADERS))
-    @exhaustive
+    @settings(exhaustive, max_examples=200)
     def detect(data: st.DataObject, body: bytes, accept: str) -> None:
         case = data.draw(OPERATIONS[DETECT].as_strategy(generation_mode=GenerationMode.POSITIVE))
         case.media_type, case.body = "image/jpeg", body

@@ -11,7 +11,7 @@ from fastapi.security import HTTPBearer
 from starlette.middleware.cors import CORSMiddleware
 
 from lanestream import __version__
-from lanestream.api import rest, websocket
+from lanestream.api import pages, rest, websocket
 from lanestream.api.problems import install_error_handlers
 from lanestream.api.service import DrawLanes, Service
 from lanestream.workers.thread_pool import ThreadPool
@@ -42,7 +42,8 @@ def create_app(engine: Engine | None, settings: Settings, draw: DrawLanes | None
         title="Lanestream",
         version=__version__,
         description="Camera frames in, tracked lane lines out. Streams of frames go to the WebSocket `/v1/stream`.",
-        # Its page loads scripts from another site.
+        # FastAPI's own pages load scripts from another site.
+        docs_url=None,
         redoc_url=None,
         lifespan=lifespan,
     )
@@ -72,3 +73,6 @@ def _include_routes(app: FastAPI, settings: Settings, *, with_keys: bool) -> Non
     elif settings.metrics_access == "open":
         app.include_router(rest.metrics_router)
     app.include_router(websocket.router)
+    app.router.routes.extend(pages.docs_page())
+    if settings.live_page:
+        app.router.routes.extend(pages.live_page())

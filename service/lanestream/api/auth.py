@@ -1,4 +1,4 @@
-"""Authentication: API keys, and for browsers the origin of the page. Checked before any work is done.
+"""Authentication: API keys and access tokens, and for browsers the origin of the page. Checked before any work is done.
 
 Each route declares its guard itself; nothing depends on how a path is spelled, so no spelling of a path evades it.
 """
@@ -8,13 +8,14 @@ from __future__ import annotations
 import ipaddress
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Self
 from urllib.parse import urlsplit
 
 from starlette.requests import HTTPConnection
 
-from lanestream.errors import ForbiddenError, UnauthorizedError
+from lanestream.api.access_tokens import TokenSigner
+from lanestream.errors import ForbiddenError, ProtocolError, UnauthorizedError
 from lanestream.keys import ApiKey, find_key, read_keys
 from lanestream.protocol import KEY_SUBPROTOCOL
 from lanestream.streaming.session_registry import Caller
@@ -32,36 +33,65 @@ _PORTS: Final = {"http": 80, "https": 443}
 
 @dataclass(frozen=True)
 class Authenticator:
-    """Identifies callers. Without `keys` every caller is accepted; `origins` are the allowed foreign web origins."""
+    """Identifies callers. Without `keys` every caller is accepted; `origins` are the allowed foreign web origins.
+
+    `signer` signs and verifies access tokens; None if they are not accepted.
+    """
 
     keys: Sequence[ApiKey] = ()
     origins: frozenset[str] = frozenset()
+    signer: TokenSigner | None = None
 
     @classmethod
     def from_settings(cls, settings: Settings) -> Self:
         """Returns the authenticator for these settings. Raises SettingsError if the file of API keys can't be used."""
-        from_file = read_keys(settings.api_keys_file) if settings.api_keys_file is not None else ()
-        return cls((*settings.api_keys, *from_file), frozenset(settings.allowed_origins))
+        return cls(_read_keys(settings), frozenset(settings.allowed_origins), TokenSigner.from_settings(settings))
+
+    def with_keys_of(self, settings: Settings) -> Self:
+        """Returns this authenticator with the keys that the file has now. Raises SettingsError if it can't be used."""
+        return replace(self, keys=_read_keys(settings))
+
+    def knows(self, caller: Caller) -> bool:
+        """Returns whether `caller`, who was authenticated before, would still be: keys can be removed."""
+        return not self.keys or any(key.name == caller.identity for key in self.keys)
 
     def authenticate(self, connection: HTTPConnection) -> Caller:
         """Returns the caller behind a request, or behind a WebSocket that is not accepted yet.
 
-        Raises ForbiddenError for a web page of a foreign origin, and UnauthorizedError for a missing or unknown key.
+        Raises ForbiddenError for a web page of a foreign origin, and UnauthorizedError for a missing or unknown key
+        and for an access token that has expired or whose key was removed.
         """
-        self._check_origin(connection)
+        # Browsers send the page's origin; programs usually send none.
+        self.check_origin(connection, connection.headers.get("origin"))
         if not self.keys:
             return Caller(_ANONYMOUS, connection.client.host if connection.client else _ANONYMOUS)
-        token = _token(connection)
-        if token is None:
-            raise UnauthorizedError("an API key is required", _HOW)
-        key = find_key(self.keys, token)
-        if key is None:
+        credential = _credential(connection)
+        key = find_key(self.keys, credential)
+        name = self._token_subject(credential) if key is None else key.name
+        if name is None:
             raise UnauthorizedError("this API key is unknown", "ask the operator of the service for a key")
-        return Caller(key.name, key.name)
+        return Caller(name, name)
 
-    def _check_origin(self, connection: HTTPConnection) -> None:
-        """Raises ForbiddenError for a foreign origin. Browsers send the page's origin; programs usually send none."""
-        origin = connection.headers.get("origin")
+    def issue_token(self, connection: HTTPConnection) -> str:
+        """Returns an access token for the caller whose API key a request has.
+
+        Raises ProtocolError if the service requires no keys, and UnauthorizedError for anything but a valid key: a
+        token can't be used to get another one.
+        """
+        if self.signer is None or not self.keys:
+            raise ProtocolError("this service requires no API key", "connect without a token")
+        key = find_key(self.keys, _credential(connection))
+        if key is None:
+            raise UnauthorizedError("an access token is issued only for an API key", _HOW)
+        return self.signer.sign(key.name)
+
+    def _token_subject(self, credential: str) -> str | None:
+        """Returns the name in an access token; None if it is not a token, or if its key was removed."""
+        name = None if self.signer is None else self.signer.verify(credential)
+        return name if any(key.name == name for key in self.keys) else None
+
+    def check_origin(self, connection: HTTPConnection, origin: str | None) -> None:
+        """Raises ForbiddenError if pages of this origin may not use the service under the host name of `connection`."""
         if origin is None or origin in self.origins or self._is_own(origin, connection.headers.get("host", "")):
             return
         raise ForbiddenError(
@@ -91,16 +121,26 @@ def warn_if_open(authenticator: Authenticator, host: str, *, loopback: bool) -> 
         )
 
 
-def _token(connection: HTTPConnection) -> str | None:
-    """Returns the key in the Authorization header, or if that header is missing, in a subprotocol."""
+def _read_keys(settings: Settings) -> tuple[ApiKey, ...]:
+    from_file = () if settings.api_keys_file is None else read_keys(settings.api_keys_file)
+    return (*settings.api_keys, *from_file)
+
+
+def _credential(connection: HTTPConnection) -> str:
+    """Returns the key or token in the Authorization header, or if that header is missing, in a subprotocol.
+
+    Raises UnauthorizedError if there is neither.
+    """
     header = connection.headers.get("authorization")
     if header is not None:
-        scheme, _, token = header.strip().partition(" ")
-        return token.strip() if scheme.lower() == _SCHEME else None
-    for subprotocol in connection.scope.get("subprotocols", ()):
-        if subprotocol.startswith(KEY_SUBPROTOCOL):
-            return str(subprotocol).removeprefix(KEY_SUBPROTOCOL)
-    return None
+        scheme, _, credential = header.strip().partition(" ")
+        if scheme.lower() == _SCHEME:
+            return credential.strip()
+    else:
+        for subprotocol in connection.scope.get("subprotocols", ()):
+            if subprotocol.startswith(KEY_SUBPROTOCOL):
+                return str(subprotocol).removeprefix(KEY_SUBPROTOCOL)
+    raise UnauthorizedError("an API key is required", _HOW)
 
 
 def _address(url: str) -> tuple[str, int | None] | None:

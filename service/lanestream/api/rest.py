@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Iterator, Sequence
+from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import cv2
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from pydantic import BaseModel
 
 from lanestream.api.metrics import MEDIA_TYPE
@@ -68,6 +69,7 @@ metrics_router = APIRouter()
 _JSON: Final = "application/json"
 _PART_BYTES: Final = 1 << 16
 _MOST_CAMERA_CHARACTERS: Final = 2048
+_MOST_ORIGIN_CHARACTERS: Final = 512
 _PICTURES: Final = {"image/jpeg": ".jpg", "image/png": ".png"}
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _FORM: Final = {"schema": {"type": "object", "properties": {"file": _BINARY["schema"]}, "required": ["file"]}}
@@ -99,6 +101,13 @@ class ModelList(BaseModel):
     models: list[ModelEntry]
 
 
+class AccessToken(BaseModel):
+    """An access token, which is used like an API key and expires after `expires_s` seconds."""
+
+    token: str
+    expires_s: float
+
+
 class Readiness(BaseModel):
     """The loaded networks of a service that is ready. `provider` runs the default detector's network, the first one.
 
@@ -124,6 +133,13 @@ _PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
 AUTH_PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     401: {"model": Problem, "description": "The API key is missing or unknown"},
     403: {"model": Problem, "description": "The origin of the web page is not allowed"},
+}
+
+
+_PROBLEMS_OF_STREAM: Final[dict[int | str, dict[str, Any]]] = {
+    403: AUTH_PROBLEMS[403],
+    422: _PROBLEMS[422],
+    503: _PROBLEMS[503],
 }
 
 
@@ -216,7 +232,7 @@ async def detect(
     with service.answering(request, caller):
         async with service.bodies.image(request, caller.quota) as data:
             with service.sessions.temporary(pool, caller, options) as session:
-                frame = await _process(service, session, caller, data)
+                frame = await _process(service, session, caller, data, request)
                 message = lanes_message(frame, seq=0, timestamp=0.0)
                 if media_type == _JSON:
                     return Response(message.model_dump_json(), media_type=_JSON)
@@ -234,6 +250,39 @@ async def models(request: Request) -> ModelList:
         for info in _service(request).pool.capabilities.detectors
     ]
     return ModelList(models=entries)
+
+
+@router.post("/v1/tokens", responses={422: _PROBLEMS[422]})
+async def tokens(request: Request) -> AccessToken:
+    """Returns an access token in exchange for the request's API key, for a web page to use instead of the key."""
+    service = _service(request)
+    token = service.authenticator.issue_token(request)
+    return AccessToken(token=token, expires_s=service.settings.token_s)
+
+
+@router.get("/v1/stream", status_code=426, response_model=Problem, responses=_PROBLEMS_OF_STREAM)
+async def stream_access(
+    request: Request,
+    origin: Annotated[
+        str | None,
+        Query(
+            max_length=_MOST_ORIGIN_CHARACTERS,
+            description="The origin of the page that asks; browsers send it only with requests to other origins.",
+        ),
+    ] = None,
+) -> Response:
+    """Responds as to a WebSocket handshake that is refused, and with 426 if the handshake would be accepted.
+
+    Browsers do not let a page see why a handshake failed, so it can ask here.
+    """
+    service = _service(request)
+    service.authenticator.check_origin(request, origin)
+    service.check_ready()
+    raise HTTPException(
+        HTTPStatus.UPGRADE_REQUIRED,
+        "this is a WebSocket, and a handshake would be accepted: connect with ws:// or wss://",
+        {"upgrade": "websocket", "connection": "upgrade"},
+    )
 
 
 @public_router.get("/v1/schema", response_model=dict[str, dict[str, Any]])
@@ -327,8 +376,11 @@ def _response_media_type(request: Request, service: Service) -> str:
     return media_type
 
 
-async def _process(service: Service, session: OpenSession, caller: Caller, data: bytes) -> ProcessedFrame:
-    """Returns the lanes of an image. Counts the frame, processed or failed."""
+async def _process(
+    service: Service, session: OpenSession, caller: Caller, data: bytes, request: Request
+) -> ProcessedFrame:
+    """Returns the lanes of an image. Counts and traces the frame, processed or failed."""
+    attributes = {"caller": caller.identity}
     service.metrics.frame_received()
     arrived = time.monotonic()
     image = EncodedFrame(data, 0.0, arrived, arrived + service.settings.body_s)
@@ -337,7 +389,11 @@ async def _process(service: Service, session: OpenSession, caller: Caller, data:
             frame = await service.pool.run(session.handle, image, slot)
     except BaseException as error:
         service.metrics.frame_failed(error)
+        if service.tracer is not None:
+            service.tracer.record(arrived, attributes, error=error, headers=request.headers)
         raise
+    if service.tracer is not None:
+        service.tracer.record(arrived, attributes, frame.result.timing_ms, headers=request.headers)
     service.metrics.frame_processed(frame.result.timing_ms, time.monotonic() - image.arrived)
     return frame
 

@@ -33,6 +33,8 @@ from lanestream.workers.process_pool import ProcessPool
 from lanestream.workers.thread_pool import ThreadPool
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from fastapi import FastAPI
 
     from lanestream.api.service import DrawLanes, Service
@@ -44,6 +46,7 @@ _log = logging.getLogger(__name__)
 _BACKLOG: Final = 2048
 _LARGEST_KEPT_BYTES: Final = 1 << 20
 _RETURN_MEMORY_S: Final = 10.0
+_KEYS_POLL_S: Final = 1.0
 # Files that the process needs besides its connections: models, pipes to workers, Redis, logs.
 _OTHER_FILES: Final = 128
 # After a drain, how long uvicorn waits for peers to close their connections.
@@ -52,11 +55,17 @@ _CLOSE_S: Final = 0.5
 _SIGNALED: Final = 128
 
 
-def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None = None) -> None:
+def serve(
+    settings: Settings,
+    load: Callable[[], Engine],
+    draw: DrawLanes | None = None,
+    on_ready: Callable[[str], None] | None = None,
+) -> None:
     """Serves until a signal stops the process.
 
     `load` returns a warm engine. It is called once the server is running, in a thread or in worker processes, which
-    must be able to import it. Raises SettingsError if the address can't be listened on, and any error of `load`.
+    must be able to import it. `on_ready` is called once frames can be processed, in a thread, with a URL that reaches
+    the service from this machine. Raises SettingsError if the address can't be listened on, and any error of `load`.
     """
     # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
     cv2.setNumThreads(settings.opencv_threads)
@@ -67,7 +76,7 @@ def serve(settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None
     server = LanestreamServer(app, settings)
     app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     with server.stopping_on_signals(), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
-        runner.run(_serve(server, listener, app, load))
+        runner.run(_serve(server, listener, app, load, on_ready))
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -107,6 +116,7 @@ class LanestreamServer(uvicorn.Server):
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         super().__init__(server_config(app, settings))
         self._service: Service = app.state.service
+        self.keys_requested = False
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -117,11 +127,16 @@ class LanestreamServer(uvicorn.Server):
     def stopping_on_signals(self) -> Iterator[None]:
         """Stops the server on SIGINT, SIGTERM or SIGHUP; ends the process at once on a second SIGINT or SIGTERM.
 
+        With a file of API keys, SIGHUP reads it again instead, as is usual for services.
+
         After the block the process ends by the first of them, so that its parent sees why it ended.
         """
         received: list[int] = []
 
         def stop(number: int, _: FrameType | None) -> None:
+            if number == signal.SIGHUP and self._service.settings.api_keys_file is not None:
+                self.keys_requested = True
+                return
             if received and number != signal.SIGHUP:
                 flush_logs()
                 os._exit(_SIGNALED + number)
@@ -151,13 +166,20 @@ class LanestreamServer(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, load: Callable[[], Engine]) -> None:
+async def _serve(
+    server: LanestreamServer,
+    listener: socket.socket,
+    app: FastAPI,
+    load: Callable[[], Engine],
+    on_ready: Callable[[str], None] | None,
+) -> None:
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     host, port = listener.getsockname()[:2]
     warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
     for conflict in package_conflicts():
         _log.warning("%s", conflict)
-    _log.info("listening on http://%s:%d, loading the networks", f"[{host}]" if ":" in host else host, port)
+    url = _http_url(host, port)
+    _log.info("listening on %s, loading the networks", url, extra={"event": "listening", "url": url})
     starting = asyncio.create_task(_start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
     if not starting.done():  # a signal came first
@@ -169,15 +191,61 @@ async def _serve(server: uvicorn.Server, listener: socket.socket, app: FastAPI, 
         app.state.service.install(pool)
         for info in pool.capabilities.detectors:
             network = info.model
-            _log.info("detector %s: %s on %s (%s)", info.detector, network.name, network.provider, network.reason)
-        _log.info("ready")
+            _log.info(
+                "detector %s: %s on %s (%s)",
+                *(info.detector, network.name, network.provider, network.reason),
+                extra={
+                    "event": "detector_loaded",
+                    "detector": info.detector,
+                    "model": network.name,
+                    "provider": network.provider,
+                },
+            )
+        _log.info("ready", extra={"event": "ready"})
+        if on_ready is not None:
+            address = ipaddress.ip_address(host)
+            loopback = "127.0.0.1" if address.version == 4 else "::1"
+            reachable = loopback if address.is_unspecified else host
+            # A daemon: what it starts, such as a browser in a terminal, may go on for as long as it likes.
+            threading.Thread(target=on_ready, args=(_http_url(reachable, port),), daemon=True).start()
     except BaseException:
         server.should_exit = True
         await serving
         raise
-    cleaning = asyncio.create_task(_return_memory())
+    upkeep = [asyncio.create_task(_return_memory())]
+    if app.state.service.settings.api_keys_file is not None:
+        upkeep.append(asyncio.create_task(_watch_keys(server, app.state.service)))
     await serving
-    cleaning.cancel()
+    for task in upkeep:
+        task.cancel()
+
+
+async def _watch_keys(server: LanestreamServer, service: Service) -> None:
+    """Reads the file of API keys again when it has changed, and when SIGHUP asks for it."""
+    path = service.settings.api_keys_file
+    assert path is not None  # noqa: S101 - checked by the caller
+    loaded, previous = None, None
+    while True:
+        await asyncio.sleep(_KEYS_POLL_S)
+        found = await asyncio.to_thread(_version_of, path)
+        # A file that is still being written may lack keys, so it must not have changed since the last look.
+        if server.keys_requested or (found != loaded and found == previous):
+            server.keys_requested, loaded = False, found
+            service.reload_keys()
+        previous = found
+
+
+def _version_of(path: Path) -> tuple[int, ...] | None:
+    """Returns what changes with the content of a file, also if another one takes its place; None if it is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _http_url(host: str, port: int) -> str:
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 async def _return_memory() -> None:

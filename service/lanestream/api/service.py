@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import json
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -16,8 +17,9 @@ from lanestream.api.byte_budget import ByteBudget
 from lanestream.api.connections import ConnectionLimits, ConnectionTable, connection_of
 from lanestream.api.metrics import Metrics
 from lanestream.api.request_body import BodyLimits, BodyReader
+from lanestream.api.tracing import open_tracer
 from lanestream.asyncapi import document
-from lanestream.errors import DrainingError, NotReadyError
+from lanestream.errors import DrainingError, NotReadyError, SettingsError
 from lanestream.protocol import Limits, json_schemas, read_camera_file
 from lanestream.session import SessionOptions
 from lanestream.streaming.session_registry import SessionRegistry
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from lanestream.settings import Settings
     from lanestream.streaming.session_registry import Caller
     from lanestream.workers.pool import WorkerPool
+
+_log = logging.getLogger(__name__)
 
 DrawLanes = Callable[["Image", "LanesMessage"], "Image"]
 
@@ -47,7 +51,7 @@ class OpenStream(Protocol):
     """An open stream, as the service sees it."""
 
     def wake(self) -> None:
-        """Makes the stream check whether the service is draining."""
+        """Makes the stream check whether it must end: the service may be draining, or the caller's key be gone."""
 
 
 class Service:
@@ -63,6 +67,7 @@ class Service:
         self.authenticator = Authenticator.from_settings(settings)
         self._camera = None if settings.camera is None else read_camera_file(settings.camera)
         self.metrics = Metrics()
+        self.tracer = open_tracer()
         self.budget = ByteBudget(settings.buffered_bytes)
         self.proxies = os.environ.get(_PROXIES_VARIABLE, "")
         self.connections = ConnectionTable(
@@ -113,6 +118,21 @@ class Service:
         """Raises NotReadyError if worker processes that end are no longer replaced."""
         if self._pool is not None and self._pool.upkeep_failed:
             raise NotReadyError("worker processes are no longer replaced", "restart the service; its log has the cause")
+
+    def reload_keys(self) -> None:
+        """Reads the file of API keys again. Streams of callers whose keys are gone end; a bad file changes nothing."""
+        try:
+            changed = self.authenticator.with_keys_of(self.settings)
+        except SettingsError as error:
+            _log.error("the API keys stay as they were: %s", error, extra={"event": "keys_refused"})
+            return
+        if changed == self.authenticator:
+            return
+        self.authenticator = changed
+        count = len(changed.keys)
+        _log.info("the API keys have changed: there are %d", count, extra={"event": "keys_changed", "keys": count})
+        for stream in self.streams:
+            stream.wake()
 
     def session_options(self, message: StartMessage) -> SessionOptions:
         """Returns the options of the session that `message` opens. Raises ProtocolError if they are contradictory."""
@@ -170,6 +190,8 @@ class Service:
         await self._store.close()
         if pool is not None:
             await pool.close()
+        if self.tracer is not None:
+            await self.tracer.close()
 
 
 def proxy_check(proxies: str) -> Callable[[str], bool]:

@@ -23,6 +23,7 @@ from lanestream.errors import (
     LanestreamError,
     NoDetectorError,
     ProtocolError,
+    UnauthorizedError,
     WorkerLostError,
     wire_status,
 )
@@ -41,7 +42,7 @@ from lanestream.streaming.stream_protocol import FrameOutcome, StreamProtocol, S
 from lanestream.workers.frame_worker import EncodedFrame
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from lanestream.api.service import Service
     from lanestream.messages import ProcessedFrame
@@ -100,7 +101,7 @@ class StreamConnection:
             self._connection.identify(caller.quota)
 
     def wake(self) -> None:
-        """Makes the watcher check the time limits, and whether the service is draining."""
+        """Makes the watcher check the time limits, and whether the stream must end."""
         self._wake_watcher.set()
 
     async def run(self) -> None:
@@ -112,7 +113,7 @@ class StreamConnection:
             self._count_close(disconnect.code)
         except Exception as error:
             if not isinstance(error, LanestreamError):
-                _log.exception("stream failed", extra=self._log_fields())
+                _log.exception("stream failed", extra=self._log_fields("stream_failed"))
             await self._end_with(error)
         finally:
             await self._release_session()
@@ -218,13 +219,13 @@ class StreamConnection:
         # The time limits of an open stream differ from those of the handshake.
         self.wake()
         self._service.metrics.session_opened()
+        opened = "resumed" if session.resumed else "opened"
+        caller, mode = self._caller.identity, self._protocol.mode
+        detector = self._service.pool.capabilities.select(self._protocol.options.detector).detector
         _log.info(
             "stream %s by %s, mode %s, detector %s",
-            "resumed" if session.resumed else "opened",
-            self._caller.identity,
-            self._protocol.mode,
-            self._service.pool.capabilities.select(self._protocol.options.detector).detector,
-            extra=self._log_fields(),
+            *(opened, caller, mode, detector),
+            extra=self._log_fields(f"stream_{opened}") | {"caller": caller, "mode": mode, "detector": detector},
         )
 
     async def _answer(self) -> None:
@@ -266,14 +267,16 @@ class StreamConnection:
             processed = await asyncio.shield(self._work)
         except Exception as error:
             if not isinstance(error, LanestreamError):
-                _log.exception("frame failed", extra=self._log_fields(frame.seq))
+                _log.exception("frame failed", extra=self._log_fields("frame_failed", frame.seq))
             self._service.metrics.frame_failed(error)
+            self._trace(session, frame, error=error)
             self._complete(session, FrameOutcome.EXPIRED if isinstance(error, ExpiredError) else FrameOutcome.FAILED)
             self._check_worker_losses(error)
             return error_message(error, seq=frame.seq)
         self._complete(session, FrameOutcome.ANSWERED)
         timing = processed.result.timing_ms
         self._service.metrics.frame_processed(timing, 1e-3 * timing["total"])
+        self._trace(session, frame, timing)
         self._warn(processed.result.warnings, frame.seq)
         return lanes_message(
             processed,
@@ -282,11 +285,27 @@ class StreamConnection:
             dropped=self._protocol.dropped,
         )
 
+    def _trace(
+        self,
+        session: OpenSession,
+        frame: IncomingFrame,
+        timing_ms: Mapping[str, float] | None = None,
+        error: Exception | None = None,
+    ) -> None:
+        tracer = self._service.tracer
+        if tracer is not None:
+            attributes: dict[str, str | int] = {
+                "session": session.id,
+                "seq": frame.seq,
+                "caller": self._caller.identity,
+            }
+            tracer.record(frame.arrived, attributes, timing_ms, error)
+
     def _warn(self, codes: Sequence[WarningCode], seq: int) -> None:
         for code in codes:
             self._protocol.warn(code, seq)
             self._service.metrics.timestamp_warning(code)
-            _log.warning("%s", WARNINGS[code][0], extra=self._log_fields(seq))
+            _log.warning("%s", WARNINGS[code][0], extra=self._log_fields("client_warning", seq) | {"code": code})
 
     def _check_worker_losses(self, error: Exception) -> None:
         """Raises the error, which ends the stream for good, if the stream's frames have cost several workers."""
@@ -318,7 +337,7 @@ class StreamConnection:
         self._service.sessions.schedule_save(session)
 
     async def _watch(self) -> None:
-        """Raises the error that ends an idle, too old or evicted stream. Announces a drain of the service."""
+        """Raises the error that ends an idle, too old, evicted or no longer allowed stream. Announces a drain."""
         while not self._service.draining:
             try:
                 async with asyncio.timeout(max(self._seconds_to_next_limit(), _MIN_WATCH_S)):
@@ -332,6 +351,8 @@ class StreamConnection:
                 raise EvictedError(
                     "the session was resumed over another socket", "use a resume token on one socket at a time"
                 )
+            if not self._service.authenticator.knows(self._caller):
+                raise UnauthorizedError("the API key of this stream was removed", "use another key")
         token = None if self._session is None else self._session.token
         self._protocol.drain(token, self._service.settings.drain_s)
         await self._send_pending()
@@ -364,7 +385,12 @@ class StreamConnection:
         _log.info(
             "stream closed after %.1f s: %d frames, %d answered, %d failed, %d dropped",
             *(count.duration_s, count.frames, count.answered, count.failed, count.dropped),
-            extra={"session": session.id},
+            extra={
+                "event": "stream_closed",
+                "session": session.id,
+                "caller": self._caller.identity,
+                **count.model_dump(exclude={"type"}),
+            },
         )
 
     async def _send_pending(self) -> None:
@@ -407,6 +433,6 @@ class StreamConnection:
         finally:
             await releasing
 
-    def _log_fields(self, seq: int | None = None) -> dict[str, str | int | None]:
+    def _log_fields(self, event: str, seq: int | None = None) -> dict[str, str | int | None]:
         """Returns the fields that log records of this stream carry besides their message."""
-        return {"session": None if self._session is None else self._session.id, "seq": seq}
+        return {"event": event, "session": None if self._session is None else self._session.id, "seq": seq}

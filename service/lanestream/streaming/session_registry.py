@@ -456,14 +456,16 @@ class SessionRegistry:
     def _note_failure(self, error: StoreError) -> None:
         """Counts a failure of the store. Logs it unless the last operation failed, too."""
         if self._store_reachable:
-            _log.warning("sessions are not saved and can't be resumed elsewhere: %s", error)
+            _log.warning(
+                "sessions are not saved and can't be resumed elsewhere: %s", error, extra={"event": "store_lost"}
+            )
         self._store_reachable = False
         if self._on_store_failure is not None:
             self._on_store_failure()
 
     def _note_success(self) -> None:
         if not self._store_reachable:
-            _log.info("sessions are saved again")
+            _log.info("sessions are saved again", extra={"event": "store_restored"})
         self._store_reachable = True
 
 

@@ -224,7 +224,11 @@ class ProcessPool(WorkerPool):
         status = await worker.wait_ended()
         uptime_s = worker.uptime_s
         self._workers.remove(worker)
-        _log.error("a worker process ended with status %d after %.1f s", status, uptime_s)
+        _log.error(
+            "a worker process ended with status %d after %.1f s",
+            *(status, uptime_s),
+            extra={"event": "worker_ended", "status": status, "duration_s": uptime_s},
+        )
         self._report("hung" if worker.hung else "ended")
         return uptime_s
 

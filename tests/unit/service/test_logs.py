@@ -229,3 +229,19 @@ def test_an_error_of_the_file_is_not_an_error_of_the_caller() -> None:
     with logging_process("os.close(2); log_lines(0, 3); flush_logs(); print(dropped_records())") as process:
         stdout, _ = process.communicate()
         assert (process.returncode, stdout) == (0, b"3\n")
+
+
+def test_the_parts_of_an_access_are_fields_and_have_no_query() -> None:
+    logger = logging.getLogger("uvicorn.access")
+    arguments = ("127.0.0.1:5", "GET", "/v1/models?key=secret", "1.1", 401)
+    access = logger.makeRecord(logger.name, logging.INFO, "x.py", 1, '%s - "%s %s HTTP/%s" %d', arguments, None)
+    QueryRemover().filter(access)
+    fields = json.loads(JsonLogFormatter().format(access))
+    assert {name: fields[name] for name in ("event", "address", "method", "path", "status")} == {
+        "event": "request",
+        "address": "127.0.0.1:5",
+        "method": "GET",
+        "path": "/v1/models",
+        "status": 401,
+    }
+    assert "secret" not in str(fields)

@@ -77,6 +77,46 @@ def test_other_kinds_are_refused_on_one_line(value: Any) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("LANESTREAM_MAX_SESSION", "did you mean LANESTREAM_MAX_SESSIONS? `lanestream serve --print-config`"),
+        ("lanestream_credit", "did you mean LANESTREAM_CREDITS?"),
+        ("LANESTREAM_QUITE_ANOTHER", "`lanestream serve --print-config` lists all settings"),
+    ],
+)
+def test_an_unknown_variable_is_refused_with_the_nearest_name(
+    name: str, hint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, "a secret?")
+    with pytest.raises(SettingsError, match=f"the environment variable {name} is not a setting") as caught:
+        load_settings()
+    assert caught.value.hint.startswith(hint)
+    assert "a secret?" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "LANESTREAM_API_KEY",
+        "LANESTREAM_DATA",
+        "LANESTREAM_PUBLISH",
+        "LANESTREAM_SERVICE_HOST",
+        "LANESTREAM_PORT_8000_TCP",
+    ],
+)
+def test_variables_of_other_programs_are_ignored(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(name, "x")
+    load_settings()
+
+
+def test_the_port_that_kubernetes_sets_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LANESTREAM_PORT", "tcp://10.3.241.7:8000")
+    with pytest.raises(SettingsError, match="Kubernetes") as caught:
+        load_settings()
+    assert "enableServiceLinks" in caught.value.hint
+
+
 def test_a_variable_can_name_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text("port = 1\n")
     monkeypatch.setenv("LANESTREAM_CONFIG", str(file))
@@ -107,7 +147,8 @@ def test_lists_come_from_variables_and_from_a_file(file: Path, monkeypatch: pyte
     [
         ("port = 'x'", "lanestream.toml: port = 'x': input should be a valid integer"),
         ("port = 70000", "lanestream.toml: port = 70000: input should be less than or equal to 65535"),
-        ("prot = 1", "lanestream.toml: prot is not a setting ("),
+        ("prot = 1", "lanestream.toml: prot is not a setting (did you mean port? `lanestream serve"),
+        ("quite_another = 1", "lanestream.toml: quite_another is not a setting (`lanestream serve"),
         ("config = 'x.toml'", "lanestream.toml: a settings file can't set config"),
         ("port =", "lanestream.toml is not valid TOML: "),
         ("api_keys = ['secret']", "lanestream.toml: api_keys: entry 1 is not a valid key; expected NAME:SHA256"),
@@ -247,6 +288,8 @@ def _row(name: str) -> str:
 def _shown(default: object) -> str:
     if isinstance(default, tuple):
         return ", ".join(default)
+    if isinstance(default, bool):
+        return str(default).lower()
     return "" if default is None else f"{default:.12g}" if isinstance(default, int | float) else str(default)
 
 
