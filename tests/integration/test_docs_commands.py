@@ -16,7 +16,7 @@ import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
@@ -58,6 +58,9 @@ NOT_RUN = [
     ("docs/deployment.md", "docker ", DOCKER),
     ("docs/deployment.md", "LANESTREAM_PUBLISH=127.0.0.1:8000-8003 docker compose", DOCKER),
     ("docs/exporting.md", "lanestream export alexnet.pt", "tests/unit/exporter/exporting/test_export_parts.py"),
+    ("docs/index.md", "pip install", "installs a release"),
+    ("docs/index.md", "lanestream stream my_drive.mp4", "is the first command of the quick start"),
+    ("docs/operations.md", "curl -X POST", "needs a service with keys; tests/integration/test_access.py"),
     ("docs/operations.md", "new WebSocket(", "one line of a web page; tests/integration/test_access.py"),
     ("docs/protocol.md", "new WebSocket(", "one line of a web page; tests/integration/test_access.py"),
     ("docs/quickstart.md", "pip install", "installs a release"),
@@ -83,8 +86,14 @@ NOT_RUN = [
 FAILING = {"lanestream doctor --require cuda >/dev/null": "error: the installed onnxruntime has no CUDA"}
 # Blocks in these languages are data or belong to other programs.
 NOT_CODE = {"json", "nginx", "text", "toml", "yaml"}
+# With Node 20 `WebSocket` is an option.
+PROGRAMS = {
+    "python": (sys.executable, "-c"),
+    "js": ("node", "--experimental-websocket", "--input-type=module", "--eval"),
+}
+SHELL_PROGRAM = ("bash", "-euo", "pipefail", "-c")
 READY_S = 60.0
-COMMAND_S = 300.0
+COMMAND_S = 200.0
 
 
 def reason_not_to_run(page: str, code: str) -> str | None:
@@ -140,18 +149,15 @@ class Reader:
     folder: Path
     port: int
     stack: ExitStack
-    done: set[str] = field(default_factory=set)
 
     def follow(self, block: Block, code: str) -> None:
         """Runs a command or a program as the page shows it."""
         where = f"{block.page}:{block.line}"
         code = re.sub(r"127\.0\.0\.1:8000|10\.0\.0\.[56]:8000", f"127.0.0.1:{self.port}", code)
-        if re.match(r"lanestream serve(?!.*--print-config)", code):
+        if re.match(r"([A-Z_]+=\S+ )*lanestream serve(?!.*--print-config)", code):
             self.port = self.stack.enter_context(serving(code, self.folder))
             return
-        program = (
-            [sys.executable, "-c", code] if block.language == "python" else ["bash", "-euo", "pipefail", "-c", code]
-        )
+        program = [*PROGRAMS.get(block.language, SHELL_PROGRAM), code]
         result = subprocess.run(
             program, cwd=self.folder, env=environment(), capture_output=True, text=True, check=False, timeout=COMMAND_S
         )
@@ -178,7 +184,7 @@ def serving(command: str, folder: Path) -> Iterator[int]:
     variables = environment(LANESTREAM_PORT=str(port), LANESTREAM_PROCESSES="1")
     with (folder / "service.log").open("w") as log:
         process = subprocess.Popen(
-            [shutil.which("bash") or "bash", "-c", f"exec {command}"], cwd=folder, env=variables, stdout=log, stderr=log
+            [shutil.which("bash") or "bash", "-c", f"exec env {command}"], cwd=folder, env=variables, stdout=log, stderr=log
         )
         try:
             wait_until_ready(process, port, folder / "service.log")
