@@ -184,7 +184,11 @@ def serving(command: str, folder: Path) -> Iterator[int]:
     variables = environment(LANESTREAM_PORT=str(port), LANESTREAM_PROCESSES="1")
     with (folder / "service.log").open("w") as log:
         process = subprocess.Popen(
-            [shutil.which("bash") or "bash", "-c", f"exec env {command}"], cwd=folder, env=variables, stdout=log, stderr=log
+            [shutil.which("bash") or "bash", "-c", f"exec env {command}"],
+            cwd=folder,
+            env=variables,
+            stdout=log,
+            stderr=log,
         )
         try:
             wait_until_ready(process, port, folder / "service.log")
