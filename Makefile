@@ -46,6 +46,10 @@ MODELS := service/lanestream/models
 
 DATA ?= ../shared/data
 
+# The names and the version of the shipped models.
+AS_REGRESSOR := --name lanestream-regressor --version $(VERSION)
+AS_CLASSIFIER := --name lanestream-alexnet --version $(VERSION)
+
 # Trains networks like the shipped ones and writes them to out/. Takes hours on a CPU; continues after an interruption.
 models: export LANESTREAM_DATA = $(DATA)
 models: $(DEV_READY)
@@ -55,11 +59,12 @@ models: $(DEV_READY)
 	$(BIN)/lanestream train classifier --run runs/classifier
 	$(BIN)/lanestream export runs/classifier/best.pt out/classifier-first.onnx --regressor out/regressor-first.onnx
 	$(BIN)/lanestream train regressor regressor-second --run runs/regressor-second --frames runs/regressor/frames
-	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx
+	$(BIN)/lanestream export runs/regressor-second/best.pt out/regressor.onnx $(AS_REGRESSOR)
 	$(BIN)/lanestream train classifier classifier-second --run runs/classifier-second
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx --regressor out/regressor.onnx
-	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx --precision fp32 \
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier.onnx $(AS_CLASSIFIER) \
 	  --regressor out/regressor.onnx
+	$(BIN)/lanestream export runs/classifier-second/best.pt out/classifier-fp32.onnx $(AS_CLASSIFIER) \
+	  --precision fp32 --regressor out/regressor.onnx
 	$(BIN)/lanestream train checkpoint runs/regressor-second/best.pt out/regressor.pt
 	$(BIN)/lanestream train checkpoint runs/classifier-second/best.pt out/classifier.pt
 

@@ -62,9 +62,9 @@ class TcpProxy:
 
 
 @contextmanager
-def tcp_proxy(port: int) -> Iterator[TcpProxy]:
-    """Runs a proxy in front of a port of this machine."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
+def tcp_proxy(port: int, own_port: int = 0) -> Iterator[TcpProxy]:
+    """Runs a proxy in front of a port of this machine, by default on a free port."""
+    with socket.create_server(("127.0.0.1", own_port)) as listener:
         proxy = TcpProxy(listener, port)
         thread = threading.Thread(target=proxy.run)
         thread.start()

@@ -67,12 +67,17 @@ def _common_options(command: _Command) -> _Command:
             metavar="KEY",
             help="API key for the service.",
         ),
-        click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network to run in process."),
+        click.option(
+            "--model",
+            type=click.Path(path_type=Path),
+            metavar="FILE|shipped",
+            help="ONNX file of the network to run in process  [default: shipped]",
+        ),
         click.option(
             "--regressor",
             type=click.Path(path_type=Path),
-            metavar="FILE|none",
-            help="ONNX file of the regressor to run in process, or none  [default: the built-in one]",
+            metavar="FILE|shipped|none",
+            help="ONNX file of the regressor to run in process  [default: shipped]",
         ),
         click.option(
             "--provider",

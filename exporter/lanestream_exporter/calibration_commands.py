@@ -11,10 +11,8 @@ from typing import Any
 
 import click
 
-from lanestream.engine import load_engine
 from lanestream.errors import SourceError
 from lanestream.protocol import CameraModel, parse_camera, read_camera_file
-from lanestream_exporter.camera_calibration import calibrate_lens, calibrate_mount, read_pictures, views
 
 
 class BoardType(click.ParamType[tuple[int, int]]):
@@ -97,6 +95,8 @@ def _writing(out: Path) -> Iterator[None]:
 def _lens(source: Path, board: tuple[int, int], height: float | None) -> CameraModel:
     if height is None:
         raise click.UsageError("the height of the camera above the road is missing: give --height")
+    from lanestream_exporter.camera_calibration import calibrate_lens, views
+
     lens = calibrate_lens(views(source), board)
     for name, reason in lens.failed:
         click.echo(f"{name} was not used: {reason}")
@@ -118,6 +118,9 @@ def _start(camera_file: Path | None, height: float | None, field_of_view: float 
 
 
 def _mount(source: Path, camera: CameraModel) -> CameraModel:
+    from lanestream.engine import load_engine
+    from lanestream_exporter.camera_calibration import calibrate_mount, read_pictures
+
     mount = calibrate_mount(read_pictures(source), camera, load_engine(provider="cpu"))
     click.echo(f"{mount.used} of {mount.frames} frames show a straight road")
     click.echo(f"pitch {mount.pitch:.2f} ± {mount.pitch_sigma:.2f} degrees down")

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.checking import DatasetCheck
-from lanestream_exporter.datasets.contact_sheet import ContactSheet
-from lanestream_exporter.datasets.files import DataFolder
-from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
-from lanestream_exporter.datasets.reading import scan_dataset
+from lanestream_exporter.choices import LABEL_FORMATS
+
+if TYPE_CHECKING:
+    from lanestream_exporter.datasets.checking import DatasetCheck
+    from lanestream_exporter.datasets.contact_sheet import ContactSheet
 
 _FORMAT = click.option(
-    "--format", "format_name", type=click.Choice([AUTO, *FORMATS]), default=AUTO, show_default=True,
+    "--format", "format_name", type=click.Choice(LABEL_FORMATS), default="auto", show_default=True,
     help="The format of the labels.",
 )  # fmt: skip
 
@@ -41,11 +42,13 @@ def check(path: Path, format_name: str, sheet: Path | None, against: Path | None
     PATH is a folder or a label file: TuSimple, CULane, Caltech, LabelMe, CVAT, mask images or clip labels. The exit
     code is 1 if anything is wrong.
     """
+    from lanestream_exporter.datasets.contact_sheet import ContactSheet
+
     contact_sheet = ContactSheet(sheet) if sheet is not None else None
     checked = _check_and_print(path, format_name, contact_sheet)
     faults = checked.faults
     if against is not None:
-        other = _check_and_print(against, AUTO, None)
+        other = _check_and_print(against, "auto", None)
         faults = [*faults, *other.faults, *checked.leaks(other)]
     for fault in faults:
         click.echo(f"bad: {fault}")
@@ -58,6 +61,11 @@ def check(path: Path, format_name: str, sheet: Path | None, against: Path | None
 
 def _check_and_print(path: Path, format_name: str, sheet: ContactSheet | None) -> DatasetCheck:
     """Reads a whole data set and prints what it holds."""
+    from lanestream_exporter.datasets.checking import DatasetCheck
+    from lanestream_exporter.datasets.files import DataFolder
+    from lanestream_exporter.datasets.formats import format_of
+    from lanestream_exporter.datasets.reading import scan_dataset
+
     name = format_of(DataFolder.at(path), format_name)
     checked = DatasetCheck()
     console = Console(stderr=True)

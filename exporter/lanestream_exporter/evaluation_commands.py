@@ -11,29 +11,16 @@ import click
 from click.core import ParameterSource
 from rich.console import Console
 
-from lanestream.engine import SHIPPED_MODEL, load_engine, resolve_regressor
 from lanestream.errors import ModelError, needs_extra
 from lanestream.writing import check_file, check_folder, writing
-from lanestream_exporter.datasets.files import DataFolder
-from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
-from lanestream_exporter.datasets.manifest import DatasetCollection
-from lanestream_exporter.datasets.reading import read_dataset
-from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
-from lanestream_exporter.evaluation.measuring import NO_EXTRAS, USUAL_EXTRAS, EvaluationSet, run_evaluation
-from lanestream_exporter.evaluation.methods import Baseline, Method, ServedModel
-from lanestream_exporter.evaluation.score import score_results
-from lanestream_exporter.evaluation.tables import figure_tables
-from lanestream_exporter.evaluation.tracking.figures import all_figures
-from lanestream_exporter.evaluation.tracking.real import real_clips, run_real
-from lanestream_exporter.evaluation.tracking.rendered import RenderedSet, run_rendered
-from lanestream_exporter.evaluation.tracking.systems import AGAINST, PRESENT, SystemSpec
-from lanestream_exporter.evaluation.tracking.tables import tracking_tables
-from lanestream_exporter.scenes.tracking_clips import KINDS
+from lanestream_exporter.choices import CLIP_KINDS, LABEL_FORMATS
 
 if TYPE_CHECKING:
     from lanestream_exporter.datasets.splits import Split
+    from lanestream_exporter.evaluation.measuring import EvaluationSet
+    from lanestream_exporter.evaluation.methods import Method
 
-_REGRESSOR: Final = "Regressor whose ego-lane prior the classifiers use, or `none`.  [default: the shipped one]"
+_REGRESSOR: Final = "Regressor whose ego-lane prior the classifiers use, `shipped` or `none`.  [default: shipped]"
 # Columns of the tables, even if the terminal has fewer.
 _MIN_WIDTH: Final = 130
 _MIN_TRACKING_WIDTH: Final = 150
@@ -45,8 +32,8 @@ _MIN_TRACKING_WIDTH: Final = 150
     "models",
     type=click.Path(path_type=Path),
     multiple=True,
-    default=[SHIPPED_MODEL],
-    help="ONNX file; may be repeated.  [default: the shipped classifier]",
+    default=[Path("shipped")],
+    help="ONNX file, or `shipped`; may be repeated.  [default: shipped]",
 )
 @click.option("--regressor", type=click.Path(path_type=Path), help=_REGRESSOR)
 @click.option("--split", type=click.Choice(["train", "val", "test"]), default="test", show_default=True)
@@ -62,7 +49,7 @@ _MIN_TRACKING_WIDTH: Final = 150
     "  [default: the shipped one]",
 )  # fmt: skip
 @click.option(
-    "--format", "format_name", type=click.Choice([AUTO, *FORMATS]), default=AUTO, help="The format of your labels."
+    "--format", "format_name", type=click.Choice(LABEL_FORMATS), default="auto", help="The format of your labels."
 )
 @click.option(
     "--labels-only", is_flag=True,
@@ -90,6 +77,9 @@ def evaluate(
     if context.invoked_subcommand is not None:
         _refuse_options(context)
         return
+    from lanestream_exporter.evaluation.measuring import NO_EXTRAS, USUAL_EXTRAS, run_evaluation
+    from lanestream_exporter.evaluation.tables import figure_tables
+
     _check_targets(out, json_path)
     evaluation_set = _evaluation_set(data, manifest, format_name, split)
     evaluation = run_evaluation(
@@ -122,13 +112,13 @@ def evaluate(
     help="Seed of the first clip of each kind; no choice is made on those from 1000 on.",
 )  # fmt: skip
 @click.option(
-    "--kind", "kinds", type=click.Choice(list(KINDS)), multiple=True, metavar="KIND",
-    help=f"Kind of rendered clips; may be repeated: {', '.join(KINDS)}.  [default: all]",
+    "--kind", "kinds", type=click.Choice(CLIP_KINDS), multiple=True, metavar="KIND",
+    help=f"Kind of rendered clips; may be repeated: {', '.join(CLIP_KINDS)}.  [default: all]",
 )  # fmt: skip
 @click.option("--calibrate", is_flag=True, help="Let the systems estimate the camera's pitch and yaw.")
 @click.option("--real", is_flag=True, help="Evaluate the labeled real clips of the manifest, too.")
 @click.option("--held-out", is_flag=True, help="With --real: also the frames that no choice was made on.")
-@click.option("--model", type=click.Path(path_type=Path), help="ONNX file.  [default: the shipped classifier]")
+@click.option("--model", type=click.Path(path_type=Path), help="ONNX file, or `shipped`.  [default: shipped]")
 @click.option(
     "--against", type=click.Path(path_type=Path), metavar="CHECKOUT",
     help="Source tree of this project to compare with, of any version since 0.9.0.",
@@ -163,11 +153,18 @@ def evaluate_tracking(
     With --against or --against-model, two systems get the same frames: this code with --model, and the other one.
     docs/evaluation.md describes each figure.
     """
+    from lanestream_exporter.datasets.manifest import DatasetCollection
+    from lanestream_exporter.evaluation.tracking.figures import all_figures
+    from lanestream_exporter.evaluation.tracking.real import real_clips, run_real
+    from lanestream_exporter.evaluation.tracking.rendered import RenderedSet, run_rendered
+    from lanestream_exporter.evaluation.tracking.systems import AGAINST, PRESENT, SystemSpec
+    from lanestream_exporter.evaluation.tracking.tables import tracking_tables
+
     _check_targets(plots, out)
     specs = [SystemSpec(PRESENT, None, model)]
     if against is not None or against_model is not None:
         specs.append(SystemSpec(AGAINST, against, against_model))
-    rendered = RenderedSet(kinds or tuple(KINDS), range(first_seed, first_seed + clips), calibrate)
+    rendered = RenderedSet(kinds or CLIP_KINDS, range(first_seed, first_seed + clips), calibrate)
     systems = {spec.name: spec.describe() for spec in specs}
     real_set = real_clips(DatasetCollection.open(manifest, data), held_out) if real else []
     runs = run_rendered(specs, rendered, jobs, _progress)
@@ -189,11 +186,19 @@ def evaluate_tracking(
 @click.argument("labels", type=click.Path(path_type=Path))
 def score(results: Path, labels: Path) -> None:
     """Evaluate RESULTS, a file that `stream --jsonl` wrote, against the LABELS of the clip."""
+    from lanestream_exporter.evaluation.score import score_results
+
     click.echo(json.dumps(score_results(results, labels), indent=2))
 
 
 def _evaluation_set(data: Path | None, manifest: Path | None, format_name: str, split: Split) -> EvaluationSet:
     """Returns a split of the manifest, or all labeled frames in `data` if it has none of the shipped data sets."""
+    from lanestream_exporter.datasets.files import DataFolder
+    from lanestream_exporter.datasets.formats import AUTO, format_of
+    from lanestream_exporter.datasets.manifest import DatasetCollection
+    from lanestream_exporter.datasets.reading import read_dataset
+    from lanestream_exporter.evaluation.measuring import EvaluationSet
+
     datasets = DatasetCollection.open(manifest, data)
     if data is None or manifest is not None or (format_name == AUTO and datasets.any_present):
         return EvaluationSet.of_split(datasets, split)
@@ -227,6 +232,10 @@ def _check_targets(folder: Path | None, file: Path | None) -> None:
 
 
 def _methods(models: Sequence[Path], regressor: Path | None) -> list[Method]:
+    from lanestream.engine import load_engine, resolve_regressor
+    from lanestream_exporter.evaluation.baselines import HoughLinesBaseline, SlidingWindowBaseline
+    from lanestream_exporter.evaluation.methods import Baseline, ServedModel
+
     regressor_file = resolve_regressor(regressor)
     ours = [ServedModel(load_engine(path, "cpu", regressor_file)) for path in models]
     methods: list[Method] = [*ours, Baseline(HoughLinesBaseline()), Baseline(SlidingWindowBaseline())]

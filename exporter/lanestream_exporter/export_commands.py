@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from rich.console import Console
 from rich.table import Table
 
-from lanestream.engine import resolve_regressor
 from lanestream.errors import ExportError
-from lanestream.road.crops import PatchGeometry
 from lanestream.writing import check_file
-from lanestream_exporter.alexnet import FULL
-from lanestream_exporter.datasets.manifest import DatasetCollection
-from lanestream_exporter.exporting.checkpoint import ForeignNetwork, read_network
-from lanestream_exporter.exporting.classifier import ExportableClassifier
-from lanestream_exporter.exporting.export import ExportReport, ExportSettings, Provenance, export_network
-from lanestream_exporter.exporting.exportable import ExportableNetwork, Precision
-from lanestream_exporter.exporting.frames import ExportFrames
-from lanestream_exporter.exporting.graph import NORMALIZATIONS
-from lanestream_exporter.exporting.proof import ModelMeasurement
-from lanestream_exporter.samples.prior_regressor import load_prior_regressor
+from lanestream_exporter.choices import NORMALIZATIONS, PRECISIONS
 
-_PATCH_KEYS = {"size": int, "half_width": float, "min_half_width": float, "obliquity": float}
+if TYPE_CHECKING:
+    from lanestream.road.crops import PatchGeometry
+    from lanestream_exporter.datasets.manifest import DatasetCollection
+    from lanestream_exporter.exporting.checkpoint import ForeignNetwork
+    from lanestream_exporter.exporting.export import ExportReport
+    from lanestream_exporter.exporting.exportable import ExportableNetwork
+    from lanestream_exporter.exporting.frames import ExportFrames
+    from lanestream_exporter.exporting.proof import ModelMeasurement
+
+_PATCH_KEYS: Final = {"size": int, "half_width": float, "min_half_width": float, "obliquity": float}
+# The checkpoints of a run; the folder's name says which run it was.
+_RUN_FILES: Final = ("best.pt", "last.pt")
+# Names and versions appear in messages, metrics and logs.
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,63}")
+_OUTSIDE_NAMES: Final = re.compile(r"[^A-Za-z0-9._+-]+")
 
 
 def _classes(_context: click.Context, _option: click.Parameter, value: str | None) -> tuple[str, ...] | None:
@@ -37,6 +42,9 @@ def _patch_geometry(_context: click.Context, _option: click.Parameter, value: st
     """Parses `size=224,half_width=0.5,min_half_width=5`; keys that are not given have their defaults."""
     if value is None:
         return None
+    from lanestream.road.crops import PatchGeometry
+    from lanestream_exporter.alexnet import FULL
+
     given: dict[str, Any] = {"size": FULL.size}
     for part in filter(None, value.split(",")):
         key, _, number = (text.strip() for text in part.partition("="))
@@ -51,11 +59,28 @@ def _patch_geometry(_context: click.Context, _option: click.Parameter, value: st
     return PatchGeometry(**given)
 
 
+def _checked_name(_context: click.Context, _option: click.Parameter, value: str | None) -> str | None:
+    if value is not None and not _NAME.fullmatch(value):
+        raise click.BadParameter(f"{value!r} is not accepted; give up to 64 letters, digits and . _ + -")
+    return value
+
+
+def default_name(checkpoint: Path) -> str:
+    """Returns the name of the run that a checkpoint belongs to, or of the file itself, as a name for the model."""
+    path = checkpoint.absolute()
+    source = path.parent.name if path.name in _RUN_FILES else path.stem
+    return _OUTSIDE_NAMES.sub("-", source).strip("-._+")[:64] or "model"
+
+
 @click.command()
 @click.argument("checkpoint", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option(
-    "--precision", type=click.Choice(get_args(Precision)), default=ExportSettings.precision, show_default=True
+    "--precision",
+    type=click.Choice(PRECISIONS),
+    default="int8",
+    show_default=True,
+    help="int8 for CPUs, fp16 for GPUs.",
 )
 @click.option(
     "--rank-energy", type=click.FloatRange(0.5, 1.0),
@@ -63,7 +88,7 @@ def _patch_geometry(_context: click.Context, _option: click.Parameter, value: st
     "  [default: 0.998 for a classifier, 0.9999 for a regressor]",
 )  # fmt: skip
 @click.option(
-    "--tolerance", type=click.FloatRange(0.0, 100.0), default=ExportSettings.tolerance, show_default=True,
+    "--tolerance", type=click.FloatRange(0.0, 100.0), default=0.5, show_default=True,
     help="Points of accuracy that the file may lose.",
 )  # fmt: skip
 @click.option(
@@ -72,25 +97,32 @@ def _patch_geometry(_context: click.Context, _option: click.Parameter, value: st
     " verified on those.",
 )  # fmt: skip
 @click.option(
-    "--scenes", type=click.IntRange(4), default=ExportFrames.rendered, show_default=True,
+    "--scenes", type=click.IntRange(4), default=48, show_default=True,
     help="Number of rendered scenes for calibration, and again for verification.",
 )  # fmt: skip
 @click.option(
-    "--regressor", type=click.Path(path_type=Path), metavar="FILE",
-    help="For a classifier: the regressor that it will be served with, or `none`  [default: the shipped one].",
+    "--regressor", type=click.Path(path_type=Path), metavar="FILE|shipped|none",
+    help="For a classifier: the regressor that it will be served with.  [default: shipped]",
 )  # fmt: skip
-@click.option("--name", help="Name of the model  [default: by its kind]")
+@click.option(
+    "--name", callback=_checked_name, help="Name of the model in messages and reports.  [default: the run's folder]"
+)
+@click.option("--version", callback=_checked_name, help="Version of the model.  [default: the date, as 2026-01-31]")
 @click.option("--classes", callback=_classes, help="For a torchvision AlexNet: its classes in order, e.g. false,lane.")
 @click.option(
     "--patch", callback=_patch_geometry,
     help="For a torchvision AlexNet: the geometry of its patches, e.g. size=224,half_width=0.5,min_half_width=5.",
 )  # fmt: skip
 @click.option(
-    "--normalization", type=click.Choice(list(NORMALIZATIONS)), default=ForeignNetwork.normalization, show_default=True,
+    "--normalization", type=click.Choice(NORMALIZATIONS), default="imagenet", show_default=True,
     help="For a torchvision AlexNet: the pixel normalization of its training.",
 )  # fmt: skip
 def export(checkpoint: Path, out: Path, **given: Any) -> None:
     """Write CHECKPOINT as the ONNX file OUT for serving, after verifying that both give the same results."""
+    from lanestream_exporter.exporting.checkpoint import read_network
+    from lanestream_exporter.exporting.export import ExportSettings, Provenance, export_network
+    from lanestream_exporter.exporting.frames import ExportFrames
+
     if out.is_dir():
         raise ExportError(f"{out} is a folder", "give the path of the file to write")
     check_file(out)
@@ -100,12 +132,19 @@ def export(checkpoint: Path, out: Path, **given: Any) -> None:
     network = _with_prior(network, given["regressor"])
     frames = ExportFrames(_datasets(training, given["data"]), rendered=given["scenes"])
     energy = network.default_rank_energy if given["rank_energy"] is None else given["rank_energy"]
-    settings = ExportSettings(given["name"] or network.default_name, energy, given["precision"], given["tolerance"])
+    name = given["name"] or default_name(checkpoint)
+    version = given["version"] or datetime.now(UTC).date().isoformat()
+    settings = ExportSettings(name, version, energy, given["precision"], given["tolerance"])
     _print_report(out, export_network(network, out, settings, Provenance(training, frames), click.echo), frames)
+    click.echo(f"model {name} {version}")
 
 
 def _with_prior(network: ExportableNetwork, regressor: Path | None) -> ExportableNetwork:
     """Returns a classifier with the prior of `regressor`, as it is served; returns a regressor unchanged."""
+    from lanestream.engine import resolve_regressor
+    from lanestream_exporter.exporting.classifier import ExportableClassifier
+    from lanestream_exporter.samples.prior_regressor import load_prior_regressor
+
     if isinstance(network, ExportableClassifier):
         path = resolve_regressor(regressor)
         return network if path is None else replace(network, prior=load_prior_regressor(path))
@@ -119,6 +158,8 @@ def _datasets(training: dict[str, Any], data: Path | None) -> DatasetCollection 
 
     The shipped manifest is only used with a data folder, `data`.
     """
+    from lanestream_exporter.datasets.manifest import DatasetCollection
+
     recipe = training.get("config", {}).get("data", {})
     manifest = recipe.get("manifest")
     if manifest is not None and Path(manifest).is_file():
@@ -129,6 +170,8 @@ def _datasets(training: dict[str, Any], data: Path | None) -> DatasetCollection 
 def _foreign_network(
     classes: tuple[str, ...] | None, geometry: PatchGeometry | None, normalization: str
 ) -> ForeignNetwork | None:
+    from lanestream_exporter.exporting.checkpoint import ForeignNetwork
+
     if classes is None and geometry is None:
         return None
     if classes is None or geometry is None:

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lanestream.errors import SourceError
-from lanestream_exporter.scenes import Drive, sample_clip, write_clip
-from lanestream_exporter.scenes.clip import ProgressCallback
-from lanestream_exporter.scenes.scene import STYLES
-from lanestream_exporter.scenes.tracking_clips import KINDS, sample_tracking_clip
-from lanestream_exporter.scenes.tracking_truth import write_tracking_clip
+from lanestream_exporter.choices import CLIP_KINDS, ROAD_STYLES
+
+if TYPE_CHECKING:
+    from lanestream_exporter.scenes.clip import ProgressCallback
 
 
 class SizeType(click.ParamType[tuple[int, int]]):
@@ -40,7 +38,7 @@ class SizeType(click.ParamType[tuple[int, int]]):
 @click.argument("out", type=click.Path(path_type=Path, dir_okay=False), metavar="OUT.mp4")
 @click.option(
     "--kind",
-    type=click.Choice(list(KINDS)),
+    type=click.Choice(CLIP_KINDS),
     help="A clip that tries a tracker, with its truth in meters; docs/training.md describes them.",
 )
 @click.option(
@@ -55,7 +53,7 @@ class SizeType(click.ParamType[tuple[int, int]]):
 @click.option("--size", default="1280x720", show_default=True, type=SizeType())
 @click.option(
     "--style",
-    type=click.Choice(list(STYLES)),
+    type=click.Choice(ROAD_STYLES),
     help="Road of an ordinary drive.  [default: highway]",
 )
 @click.option("--any-weather", is_flag=True, help="Sample night, rain, fog and camera faults too, not only clear days.")
@@ -72,6 +70,12 @@ def scene(
     labels: Path | None,
 ) -> None:
     """Render a drive to the video OUT.mp4, with exact labels for every frame."""
+    import numpy as np
+
+    from lanestream_exporter.scenes import Drive, sample_clip, write_clip
+    from lanestream_exporter.scenes.tracking_clips import sample_tracking_clip
+    from lanestream_exporter.scenes.tracking_truth import write_tracking_clip
+
     labels = labels or out.with_suffix(".jsonl")
     if kind and (seconds or style or any_weather):
         raise click.UsageError("--seconds, --style and --any-weather don't apply to a --kind; leave them out")

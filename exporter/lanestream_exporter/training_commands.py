@@ -7,20 +7,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from lanestream.writing import check_file, check_folder
-from lanestream_exporter.datasets.manifest import origin_of
-from lanestream_exporter.samples.patch_files import PatchCache
 from lanestream_exporter.toml_files import CONFIG_FOLDER
-from lanestream_exporter.training.classifier import ClassifierTask, starting_network
-from lanestream_exporter.training.config import C, ClassifierConfig, RegressorConfig, TrainConfig, read_config
-from lanestream_exporter.training.data_sources import frame_sources, open_datasets, patch_files
-from lanestream_exporter.training.loop import Run, Task, TrainingProgress, best_device, describe_device
-from lanestream_exporter.training.regressor import RegressorTask, starting_regressor
-from lanestream_exporter.training.shipped import write_half
+
+if TYPE_CHECKING:
+    from lanestream_exporter.training.config import C, TrainConfig
+    from lanestream_exporter.training.loop import Task, TrainingProgress
 
 _INTERRUPTED = 130
 
@@ -60,6 +57,12 @@ def classifier(
 
     Renders scenes, cuts patches from them and from real frames, and mixes the two.
     """
+    from lanestream_exporter.datasets.manifest import origin_of
+    from lanestream_exporter.samples.patch_files import PatchCache
+    from lanestream_exporter.training.classifier import ClassifierTask, starting_network
+    from lanestream_exporter.training.config import ClassifierConfig, read_config
+    from lanestream_exporter.training.data_sources import open_datasets, patch_files
+
     settings = _changed(read_config(config, ClassifierConfig), initial, manifest)
     check_folder(folder)
     network = starting_network(settings)  # before the patches, so that a bad checkpoint is reported early
@@ -88,6 +91,11 @@ def regressor(
 
     Renders scenes, and warps them and real frames as other cameras and roads would show them.
     """
+    from lanestream_exporter.datasets.manifest import origin_of
+    from lanestream_exporter.training.config import RegressorConfig, read_config
+    from lanestream_exporter.training.data_sources import frame_sources, open_datasets
+    from lanestream_exporter.training.regressor import RegressorTask, starting_regressor
+
     settings = _changed(read_config(config, RegressorConfig), initial, manifest)
     check_folder(folder)
     network = starting_regressor(settings)
@@ -105,6 +113,8 @@ def regressor(
 @click.argument("out", type=click.Path(path_type=Path))
 def checkpoint(source: Path, out: Path) -> None:
     """Write the checkpoint SOURCE of a run to OUT in half precision, as a small file for others to start from."""
+    from lanestream_exporter.training.shipped import write_half
+
     check_file(out)
     write_half(source, out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
@@ -129,6 +139,8 @@ def _changed(config: C, initial: str | None, manifest: str | None) -> C:
 
 def _train(task: Task, config: TrainConfig, folder: Path) -> None:
     """Trains to the end or until interrupted, and shows the progress."""
+    from lanestream_exporter.training.loop import Run, best_device, describe_device
+
     run = Run(task, config, folder)
     click.echo(f"training on {describe_device(best_device())}" + (f" from step {run.step} on" if run.step else ""))
     with interruptible() as stopped, _progress() as bar:

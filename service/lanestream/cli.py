@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from lanestream import __version__
-from lanestream.errors import CameraLostError, LanestreamError, needs_extra, needs_whole_packages
+from lanestream.errors import CameraLostError, LanestreamError, missing_extra, needs_extra, needs_whole_packages
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES
 from lanestream.keys import new_key
 
@@ -34,6 +34,9 @@ _EXIT_CAMERA_LOST: Final = 3
 _EXIT_INTERRUPTED: Final = 130
 _EXIT_TERMINATED: Final = 143
 
+# The extra that the commands of this package need when they run.
+_SERVICE_EXTRA: Final = "service,cpu"
+
 # Each entry point of this group is a mapping from a command's name to the fields of a MountedCommand.
 _COMMANDS_GROUP: Final = "lanestream.commands"
 # An entry point of this group is a function that draws a `lanes` message on an image.
@@ -44,7 +47,8 @@ _OVERLAYS_GROUP: Final = "lanestream.overlays"
 class MountedCommand:
     """A command that is imported when it is called: its `target` is "module:function".
 
-    `extra` names the optional packages that it imports, as in `pip install 'lanestream[EXTRA]'`.
+    `extra` names the optional packages that it needs when it runs, as in `pip install 'lanestream[EXTRA]'`. Its module
+    imports none of them at the top, so that its help and its usage errors work without them.
     """
 
     target: str
@@ -52,16 +56,10 @@ class MountedCommand:
     help: str
 
     def load(self) -> click.Command:
-        """Imports the command. Raises MissingExtraError if its packages are not installed."""
+        """Imports the command."""
         module, _, name = self.target.partition(":")
-        with needs_extra(self.extra):
-            command: click.Command = getattr(import_module(module), name)
+        command: click.Command = getattr(import_module(module), name)
         return command
-
-
-_DOCTOR: Final = MountedCommand(
-    "lanestream.doctor:doctor", "service,cpu", "Report which execution providers work here, and how fast."
-)
 
 
 class CommandGroup(click.Group):
@@ -70,7 +68,7 @@ class CommandGroup(click.Group):
     @cached_property
     def mounted(self) -> Mapping[str, MountedCommand]:
         """The mounted commands by name."""
-        commands = {"doctor": _DOCTOR}
+        commands: dict[str, MountedCommand] = {}
         for entry_point in entry_points(group=_COMMANDS_GROUP):
             commands |= {name: MountedCommand(**fields) for name, fields in entry_point.load().items()}
         return commands
@@ -80,9 +78,17 @@ class CommandGroup(click.Group):
         return sorted({*super().list_commands(ctx), *self.mounted})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Returns the command of that name, or None. Raises MissingExtraError if its packages are not installed."""
+        """Returns the command of that name, or None."""
         mounted = self.mounted.get(cmd_name)
         return super().get_command(ctx, cmd_name) if mounted is None else mounted.load()
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Runs the command. Raises MissingExtraError if it imports a package that is not installed."""
+        try:
+            return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            mounted = self.mounted.get(ctx.invoked_subcommand or "")
+            raise missing_extra(error, _SERVICE_EXTRA if mounted is None else mounted.extra) from None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the list of commands for the help."""
@@ -91,6 +97,20 @@ class CommandGroup(click.Group):
             lines[name] = self.commands[name].get_short_help_str(90)
         with formatter.section("Commands"):
             formatter.write_dl(sorted(lines.items()))
+
+
+_MODEL: Final = click.option(
+    "--model",
+    type=click.Path(path_type=Path),
+    metavar="FILE|shipped",
+    help="ONNX file of the network  [default: shipped]",
+)
+_REGRESSOR: Final = click.option(
+    "--regressor",
+    type=click.Path(path_type=Path),
+    metavar="FILE|shipped|none",
+    help="ONNX file of the regressor  [default: shipped]",
+)
 
 
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -105,13 +125,8 @@ def cli(context: click.Context) -> None:
 @click.option("--config", type=click.Path(path_type=Path), help="TOML file with settings.")
 @click.option("--host", help="Address to listen on  [default: 127.0.0.1]")
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]")
-@click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the built-in one]")
-@click.option(
-    "--regressor",
-    type=click.Path(path_type=Path),
-    metavar="FILE|none",
-    help="ONNX file of the regressor, or none  [default: the built-in one]",
-)
+@_MODEL
+@_REGRESSOR
 @click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="Execution provider  [default: auto]")
 @click.option("--max-sessions", type=click.IntRange(1), help="Maximum number of concurrent streams  [default: 64]")
 @click.option("--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 per line.")
@@ -126,13 +141,12 @@ def serve(*, open_page: bool, print_config: bool, **options: Any) -> None:
 
     Every setting can also be given as LANESTREAM_<NAME>, or in the file of --config. --print-config lists them all.
     """
-    with needs_extra("service,cpu"):
-        from lanestream.api.server import serve as run
-        from lanestream.engine import load_engine, resolve_regressor
-        from lanestream.settings import load_settings, to_toml
+    from lanestream.api.server import serve as run
+    from lanestream.engine import load_engine, resolve_regressor
+    from lanestream.settings import load_settings, to_toml
 
-        # Last: OpenCV reads its pixel limit when it is first imported, and the service's modules set that limit before.
-        draw_lanes = _load_overlay()
+    # Last: OpenCV reads its pixel limit when it is first imported, and the service's modules set that limit before.
+    draw_lanes = _load_overlay()
     settings = load_settings(**options)
     if print_config:
         click.echo(to_toml(settings))
@@ -155,6 +169,44 @@ def key(name: str) -> None:
     click.echo(f"key:      {token}")
     click.echo(f"setting:  {setting}")
     click.echo("Give the key to the caller. Add the setting to LANESTREAM_API_KEYS or to the keys file.", err=True)
+
+
+@cli.command()
+@click.option(
+    "--require",
+    "required",
+    type=click.Choice(PROVIDER_NAMES[1:]),
+    help="Fail unless all networks run on this provider.",
+)
+@click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="The provider to run on  [default: auto]")
+@_MODEL
+@_REGRESSOR
+@click.option("--config", type=click.Path(path_type=Path), help="TOML file of settings, as for `serve`.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+@click.pass_context
+def doctor(context: click.Context, /, *, required: str | None, as_json: bool, **given: Any) -> None:
+    """Report which execution providers work here, and how fast.
+
+    The networks are loaded and timed with the same settings as for `serve`. Suggestions say what would be faster.
+    """
+    from lanestream.doctor import diagnose, print_diagnosis
+    from lanestream.settings import load_settings
+
+    diagnosis = diagnose(load_settings(**given), required)
+    print_diagnosis(diagnosis, as_json=as_json)
+    if diagnosis.problem is not None:
+        click.echo(f"error: {diagnosis.problem}", err=True)
+        context.exit(1)
+
+
+@cli.command()
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE]...")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+def models(files: tuple[Path, ...], *, as_json: bool) -> None:
+    """Describe model files, by default the shipped ones."""
+    from lanestream.model_files import describe_models, print_models
+
+    print_models(describe_models(files), as_json=as_json)
 
 
 def main() -> None:
@@ -207,9 +259,10 @@ def _load_local_engine(model: Path | None, provider: str | None, regressor: Path
             ctx=click.get_current_context(),
             param_hint="'--provider'",
         )
-    with needs_extra("service,cpu"):
+    with needs_extra(_SERVICE_EXTRA):
         from lanestream.local import LocalEngine
-    return LocalEngine.load(model, chosen, regressor)
+
+        return LocalEngine.load(model, chosen, regressor)
 
 
 def _load_overlay() -> Callable[..., Any] | None:

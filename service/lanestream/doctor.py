@@ -1,4 +1,4 @@
-"""The command `doctor`: loads and times the networks, and reports what they run on, as tables or as JSON."""
+"""What `doctor` reports: the networks, loaded and timed, and what they run on, as tables or as JSON."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import click
 from rich import box
@@ -18,16 +18,18 @@ from rich.table import Table
 from rich.text import Text
 
 from lanestream import __version__
-from lanestream.engine import SHIPPED_MODEL, resolve_regressor
+from lanestream.engine import resolve_model, resolve_regressor
 from lanestream.errors import LanestreamError
 from lanestream.gpu import Gpu, gpu
 from lanestream.host import Cpu, cpu
 from lanestream.inference.loaded_model import LoadedModel
 from lanestream.inference.loading import load_model
 from lanestream.inference.model_info import RegressorInfo
-from lanestream.inference.providers import AUTO, PROVIDER_NAMES, PROVIDERS, Installed
+from lanestream.inference.providers import AUTO, PROVIDERS, Installed
 from lanestream.packages import installed_versions, owner_versions, package_conflicts
-from lanestream.settings import Settings, load_settings
+from lanestream.settings import Settings
+from lanestream.suggestions import Findings, Suggestion, suggestions
+from lanestream.workers.process_pool import processes_in_memory
 
 _PACKAGES: Final = ("openvino", "numpy")
 # The batch sizes to time, as far as they are among a model's batch sizes.
@@ -66,7 +68,7 @@ class Diagnosis:
 
     `software` maps installed packages to their versions; `conflicts` are lines about those that overwrite each other.
     `installed` lists the providers that are built in; whether one works shows in `networks`. `asked` is the provider
-    that the networks were asked to run on.
+    that the networks were asked to run on. `suggestions` say what would be faster.
     """
 
     software: Mapping[str, str]
@@ -76,42 +78,8 @@ class Diagnosis:
     installed: tuple[str, ...]
     asked: str
     networks: tuple[NetworkReport, ...]
+    suggestions: tuple[Suggestion, ...]
     problem: str | None
-
-
-@click.command()
-@click.option(
-    "--require",
-    "required",
-    type=click.Choice(PROVIDER_NAMES[1:]),
-    help="Fail unless all networks run on this provider.",
-)
-@click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="The provider to run on  [default: auto]")
-@click.option("--model", type=click.Path(path_type=Path), help="ONNX file of the network  [default: the shipped one]")
-@click.option(
-    "--regressor",
-    type=click.Path(path_type=Path),
-    metavar="FILE|none",
-    help="ONNX file of the second network, or none  [default: the shipped one]",
-)
-@click.option("--config", type=click.Path(path_type=Path), help="TOML file of settings, as for `serve`.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
-@click.pass_context
-def doctor(context: click.Context, /, required: str | None, as_json: bool, **given: Any) -> None:
-    """Show what the networks run on and how fast they are, with the same settings as `serve`."""
-    diagnosis = diagnose(load_settings(**given), required)
-    if as_json:
-        click.echo(json.dumps(asdict(diagnosis), indent=2))
-    else:
-        console = Console(highlight=False)
-        if not console.is_terminal:
-            console.width = _PIPE_WIDTH
-        for table in diagnosis_tables(diagnosis):
-            console.print(table)
-            console.print()
-    if diagnosis.problem is not None:
-        click.echo(f"error: {diagnosis.problem}", err=True)
-        context.exit(1)
 
 
 def diagnose(settings: Settings, required: str | None = None) -> Diagnosis:
@@ -131,16 +99,40 @@ def diagnose(settings: Settings, required: str | None = None) -> Diagnosis:
     if elsewhere and problem is None:
         network = elsewhere[0]
         problem = f"{network.name} runs on {network.provider}, not on {required}: {network.reason}"
-    return Diagnosis(
-        software=_software(),
-        conflicts=package_conflicts(),
+    findings = Findings(
         cpu=cpu(),
         gpu=gpu(),
         installed=_installed_providers(),
         asked=provider,
+        runs_on=tuple(network.provider for network in networks),
+        precisions=tuple(network.precision for network in networks),
+        skipped=next((network.reason for network in networks if network.fell_back), None),
+        worker_limit=processes_in_memory(),
+    )
+    return Diagnosis(
+        software=_software(),
+        conflicts=package_conflicts(),
+        cpu=findings.cpu,
+        gpu=findings.gpu,
+        installed=findings.installed,
+        asked=provider,
         networks=tuple(networks),
+        suggestions=suggestions(findings),
         problem=problem,
     )
+
+
+def print_diagnosis(diagnosis: Diagnosis, *, as_json: bool) -> None:
+    """Prints tables, or one JSON document."""
+    if as_json:
+        click.echo(json.dumps(asdict(diagnosis), indent=2))
+        return
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = _PIPE_WIDTH
+    for table in diagnosis_tables(diagnosis):
+        console.print(table)
+        console.print()
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> Iterator[Table]:
@@ -159,10 +151,12 @@ def diagnosis_tables(diagnosis: Diagnosis) -> Iterator[Table]:
     for network in diagnosis.networks:
         yield _table(network.kind, _network_rows(network))
         yield _run_times(network)
+    if diagnosis.suggestions:
+        yield _table("suggestions", [(each.topic.replace("_", " "), each.text) for each in diagnosis.suggestions])
 
 
 def _load_networks(settings: Settings, provider: str) -> Iterator[NetworkReport]:
-    network, report = _load_network(settings.model or SHIPPED_MODEL, provider, settings)
+    network, report = _load_network(resolve_model(settings.model), provider, settings)
     yield report
     regressor = resolve_regressor(settings.regressor)
     if regressor is not None and not isinstance(network.info, RegressorInfo):

@@ -27,6 +27,9 @@ from lanestream.tracking.departure import UNKNOWN_MOTION, VehicleMotion
 # The shipped networks, which are the default.
 SHIPPED_MODEL: Final = Path(__file__).parent / "models" / "classifier.onnx"
 SHIPPED_REGRESSOR: Final = Path(__file__).parent / "models" / "regressor.onnx"
+# The names that stand for these files and for no regressor, where a user gives a path.
+_SHIPPED: Final = Path("shipped")
+_NONE: Final = Path("none")
 
 
 @dataclass(frozen=True)
@@ -97,14 +100,14 @@ def load_engine(
     regressor: Path | None = SHIPPED_REGRESSOR,
     options: RuntimeOptions = DEFAULT_OPTIONS,
 ) -> Engine:
-    """Loads the model file at `model`, by default the shipped classifier, and warms it up.
+    """Loads the model file at `model`, by default or for `shipped` the shipped classifier, and warms it up.
 
     With a classifier the `regressor` provides the ego-lane prior, and is a detector itself; None omits it. A regressor
     as the `model` is the only detector. Raises ModelError for a file that cannot be served, ProviderError if `provider`
     cannot be used.
     """
     keep_freed_memory()
-    main = load_model(model or SHIPPED_MODEL, provider, options)
+    main = load_model(resolve_model(model), provider, options)
     models: dict[ModelRole, LoadedModel] = {main.info.kind: main}
     if main.info.kind == "classifier" and regressor is not None:
         models["regressor"] = load_model(regressor, provider, options)
@@ -117,8 +120,16 @@ def load_engine(
     return Engine.of(models)
 
 
+def resolve_model(path: Path | None) -> Path:
+    """Returns the model file for a user's setting: the shipped classifier for None and for the path `shipped`."""
+    return SHIPPED_MODEL if path in (None, _SHIPPED) else path
+
+
 def resolve_regressor(path: Path | None) -> Path | None:
-    """Returns the regressor file for a user's setting: the shipped one for None, None for the path `none`."""
-    if path is None:
+    """Returns the regressor file for a user's setting: the shipped one for None and for the path `shipped`.
+
+    Returns None for the path `none`.
+    """
+    if path in (None, _SHIPPED):
         return SHIPPED_REGRESSOR
-    return None if path == Path("none") else path
+    return None if path == _NONE else path

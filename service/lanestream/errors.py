@@ -274,10 +274,14 @@ def needs_extra(extra: str) -> Iterator[None]:
         with needs_whole_packages():
             yield
     except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"this needs the package {error.name}, which is not installed",
-            f"pip install 'lanestream[{extra}]'",
-        ) from None
+        raise missing_extra(error, extra) from None
+
+
+def missing_extra(error: ModuleNotFoundError, extra: str) -> MissingExtraError:
+    """Returns the error that says how to install the package that is missing according to `error`."""
+    return MissingExtraError(
+        f"this needs the package {error.name}, which is not installed", f"pip install 'lanestream[{extra}]'"
+    )
 
 
 @contextmanager

@@ -109,9 +109,9 @@ class Settings(BaseSettings):
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 selects a free one.")
-    model: Path | None = Field(default=None, description="ONNX file of the network; the shipped one if not set.")
+    model: Path | None = Field(default=None, description="ONNX file of the network, or `shipped`, the default.")
     regressor: Path | None = Field(
-        default=None, description="ONNX file of the regressor, or `none`; the shipped one if not set."
+        default=None, description="ONNX file of the regressor, `shipped`, the default, or `none`."
     )
     provider: Annotated[str, AfterValidator(_provider)] = Field(
         default=AUTO, description="Execution provider of the networks."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -42,6 +43,8 @@ def test_it_learns(toy: Path) -> None:
 
 def test_the_model_records_what_it_was_trained_on(toy: Path) -> None:
     info = load(toy / "toy.onnx").info
+    assert info.name == "run", "the name of the folder"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", info.version)
     assert info.training["config"]["steps"] == curve(toy)[-1]["step"]
     assert info.training["data"]["real_frames"] == [{"name": "toy roads"}]
     assert info.training["data"]["real"]["train"]["patches"] > 100

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score
 from torch import Tensor, nn
 
-from lanestream import __version__
 from lanestream.detection.candidate_detector import CandidateDetector
 from lanestream.detection.classification import Classification
 from lanestream.detection.interface import FrameContext, Infer, ModelRole
@@ -89,7 +88,6 @@ class ExportableClassifier:
     calibration: Calibration = Calibration()
     prior: PriorRegressor | None = None
 
-    default_name = "lanestream-alexnet"
     input_name = "patches"
     output_name = "probabilities"
     fp32_layers = ("network.classifier.6.",)
@@ -193,7 +191,7 @@ class ExportableClassifier:
         return ClassifierInfo(
             kind="classifier",
             name=description.name,
-            version=__version__,
+            version=description.version,
             classes=self.classes,
             types=MARKING_TYPES if self._classifies_markings else (),
             colors=MARKING_COLORS if self._classifies_markings else (),

@@ -39,12 +39,13 @@ _RANGE_INPUTS: Final = 256
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """What to write: the model's `name`, the `rank_energy` of the hidden layers to keep, the `precision`.
+    """What to write: the model's `name` and `version`, the `rank_energy` of the hidden layers to keep, the `precision`.
 
     `tolerance` is how many points of accuracy the file may lose against the checkpoint.
     """
 
     name: str
+    version: str
     rank_energy: float
     precision: Precision = "int8"
     tolerance: float = 0.5
@@ -122,15 +123,19 @@ def export_network(
         progress(f"writing {settings.precision}")
         files = _write_files(network, settings.precision, training_inputs[:_RANGE_INPUTS], Path(folder))
         for path in files.values():
-            describe(path, network.info(ExportDescription(settings.name, settings.precision, training, {})))
+            describe(path, network.info(_description(settings, training, {})))
         progress("verifying")
         report = _measure(original, network, validation, files, settings.precision)
         _check_tolerance(report, settings)
         metrics = _metadata_metrics(report, frames)
         finished = files[settings.precision]
-        describe(finished, network.info(ExportDescription(settings.name, settings.precision, training, metrics)))
+        describe(finished, network.info(_description(settings, training, metrics)))
         publish(finished, out)
     return report
+
+
+def _description(settings: ExportSettings, training: dict[str, Any], metrics: dict[str, Any]) -> ExportDescription:
+    return ExportDescription(settings.name, settings.version, settings.precision, training, metrics)
 
 
 def _write_files(

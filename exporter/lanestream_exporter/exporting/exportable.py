@@ -58,6 +58,7 @@ class ExportDescription:
     """The part of a file's metadata that does not depend on the kind of network."""
 
     name: str
+    version: str
     precision: Precision
     training: dict[str, Any]
     metrics: dict[str, Any]
@@ -85,10 +86,6 @@ class ExportableNetwork(Protocol):
     @property
     def guarded_metrics(self) -> Sequence[str]:
         """Returns the names of the metrics, shares, that the tolerance of an export applies to."""
-
-    @property
-    def default_name(self) -> str:
-        """Returns the default name of the model."""
 
     @property
     def calibration(self) -> Calibration:

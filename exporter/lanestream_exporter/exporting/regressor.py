@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.special import logit
 from torch import Tensor, nn
 
-from lanestream import __version__
 from lanestream.detection.ego_prior import RoadRegressor
 from lanestream.detection.interface import FrameContext, Infer, ModelRole
 from lanestream.detection.regression_detector import RegressionDetector
@@ -70,7 +69,6 @@ class ExportableRegressor:
     network: LaneRegressor
     calibration: Calibration = Calibration()
 
-    default_name = "lanestream-regressor"
     input_name = "road_crops"
     output_name = "readings"
     # These layers have few weights and take little time, but every output depends on them to a thousandth of the width.
@@ -173,7 +171,7 @@ class ExportableRegressor:
         return RegressorInfo(
             kind="regressor",
             name=description.name,
-            version=__version__,
+            version=description.version,
             kinds=BOUNDARY_KINDS,
             road_crop=self._geometry,
             threshold=self.calibration.threshold,

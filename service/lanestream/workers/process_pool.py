@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 # Each process has its own networks, so more processes are started only on request.
-_MOST_PROCESSES: Final = 8
+MOST_PROCESSES: Final = 8
 # The memory that a worker and the service itself may need for frames of any accepted size.
 _WORKER_BYTES: Final = 400e6
 _SERVICE_BYTES: Final = 300e6
@@ -263,11 +263,15 @@ async def _add(workers: list[Worker], setup: WorkerSetup, start_s: float) -> Non
     workers.append(await Worker.start(setup, start_s))
 
 
+def processes_in_memory() -> int:
+    """Returns how many worker processes the container's memory has room for; `MOST_PROCESSES` without a limit."""
+    memory = memory_limit()
+    return MOST_PROCESSES if memory is None else max(1, int((memory - _SERVICE_BYTES) / _WORKER_BYTES))
+
+
 def default_processes(capabilities: Capabilities) -> int:
     """Returns the default number of worker processes."""
     on_gpu = {spec.name for spec in PROVIDERS if spec.on_gpu}
     if any(info.model.provider in on_gpu for info in capabilities.detectors):
         return 1
-    memory = memory_limit()
-    room = _MOST_PROCESSES if memory is None else max(1, int((memory - _SERVICE_BYTES) / _WORKER_BYTES))
-    return min(processors(), room, _MOST_PROCESSES)
+    return min(processors(), processes_in_memory(), MOST_PROCESSES)

@@ -149,8 +149,8 @@ def test_the_command_writes_a_camera_file(tmp_path: Path, boards: list[Image]) -
 
 def test_the_command_adds_the_direction_to_a_camera_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     engine = fakes.engine(detector=YawedDetector(319.5, iter(lambda: True, False)))
-    monkeypatch.setattr(calibration_commands, "load_engine", lambda provider: engine)
-    monkeypatch.setattr(calibration_commands, "read_pictures", lambda _: drive(450))
+    monkeypatch.setattr("lanestream.engine.load_engine", lambda provider: engine)
+    monkeypatch.setattr("lanestream_exporter.camera_calibration.read_pictures", lambda _: drive(450))
     start, out = tmp_path / "lens.json", tmp_path / "camera.json"
     start.write_text('{"height": 1.2, "field_of_view": 62, "roll": 1}')
     result = calibrate(tmp_path, "-o", out, "--camera", start, "--height", 1.5)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lanestream import __version__
 from lanestream.detection.interface import Detections, Detector, FrameContext, Infer
-from lanestream.engine import load_engine, resolve_regressor
+from lanestream.engine import load_engine, resolve_model, resolve_regressor
 from lanestream.errors import SourceError
 from lanestream.local import LocalCamera, LocalEngine
 from lanestream.road.view import Image
@@ -97,7 +97,7 @@ class CheckoutSystem:
         environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         # -P: the modules beside the worker are not the checkout's.
         self._process = subprocess.Popen(  # noqa: S603 - this Python, with a file of this package
-            [sys.executable, "-P", worker.__file__, *([] if model is None else [str(model.resolve())])],
+            [sys.executable, "-P", worker.__file__, *([] if model is None else [str(resolve_model(model).resolve())])],
             env=environment,
             cwd=folder,
             stdin=subprocess.PIPE,

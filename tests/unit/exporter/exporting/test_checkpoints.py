@@ -82,7 +82,7 @@ def test_a_network_keeps_its_outputs(saved: Any, outputs: int) -> None:
     exportable, _ = read_network(saved({"network": AlexNet(outputs, shape).state_dict(), "record": record}))
     assert isinstance(exportable, ExportableClassifier)
     assert exportable.network.outputs == outputs
-    described = exportable.info(ExportDescription("own", "fp32", {}, {}))
+    described = exportable.info(ExportDescription("own", "1", "fp32", {}, {}))
     assert described.outputs == outputs
     assert len(described.types) == (4 if outputs == 9 else 0)
 

@@ -42,7 +42,7 @@ PROVENANCE = Provenance({"data": "none", "step": 7}, SOURCE)
 
 def settings(precision: Precision) -> ExportSettings:
     """Returns settings with no limit on accuracy, which is random for an untrained network."""
-    return ExportSettings("tiny", 0.9, precision, tolerance=100.0)
+    return ExportSettings("tiny", "1", 0.9, precision, tolerance=100.0)
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def test_half_precision_loads_on_the_cpu_and_agrees(classifier: Exported, tmp_pa
     path = tmp_path / "fp16.onnx"
     names = exportable.input_name, exportable.output_name
     write_graph(exportable.serving_module(half=True), classifier.validation.inputs, path, names)
-    describe(path, exportable.info(ExportDescription("half", "fp16", {}, {})))
+    describe(path, exportable.info(ExportDescription("half", "1", "fp16", {}, {})))
     graph = onnx.load(str(path)).graph
     weights = [tensor for tensor in graph.initializer if tensor.name.endswith("weight")]
     assert {tensor.data_type for tensor in weights} == {onnx.TensorProto.FLOAT16}
@@ -249,7 +249,7 @@ def test_accuracy_beyond_the_tolerance_is_refused(classifier: Exported, lost: di
     good = {"accuracy": 0.912, "average_precision": 0.9}
     fp32, checkpoint = replace(report.fp32, metrics=good), replace(report.checkpoint, metrics={"accuracy": 0.911})
     passing = replace(report, checkpoint=checkpoint, fp32=fp32, written=replace(report.written, metrics=good))
-    limits = ExportSettings("x", 0.9, "int8")
+    limits = ExportSettings("x", "1", 0.9, "int8")
     export._check_tolerance(passing, limits)
     with pytest.raises(ExportError) as caught:
         export._check_tolerance(replace(passing, written=replace(report.written, metrics=lost)), limits)
@@ -289,7 +289,7 @@ def test_a_foreign_network_keeps_its_own_normalization(classifier: Exported) -> 
         logits = ClassifierLogits.of(foreign.network(x))
         expected = np.hstack([torch.softmax(each, dim=1) for each in (logits.kinds, logits.types, logits.colors)])
     np.testing.assert_allclose(in_batches(foreign.serving_module(), inputs).numpy(), expected, atol=1e-4)
-    assert foreign.info(ExportDescription("foreign", "fp32", {}, {})).training == {"normalization": "imagenet"}
+    assert foreign.info(ExportDescription("foreign", "1", "fp32", {}, {})).training == {"normalization": "imagenet"}
 
 
 def test_invalid_model_files_are_rejected_in_one_line(classifier: Exported, tmp_path: Path) -> None:

@@ -58,6 +58,34 @@ def test_classes_and_patch_geometry_must_be_given_together(tmp_path: Path) -> No
     assert "both --classes and --patch" in result.output
 
 
+@pytest.mark.parametrize(
+    ("checkpoint", "name"),
+    [
+        ("runs/mine/best.pt", "mine"),
+        ("runs/my roads (2)/last.pt", "my-roads-2"),
+        ("downloads/alexnet.v2.pt", "alexnet.v2"),
+        ("runs/Straße/best.pt", "Stra-e"),
+        ("/best.pt", "model"),
+    ],
+)
+def test_a_model_is_named_after_its_run(checkpoint: str, name: str) -> None:
+    assert export_commands.default_name(Path(checkpoint)) == name
+
+
+def test_the_folder_of_a_run_may_be_the_current_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "runs").mkdir()
+    monkeypatch.chdir(tmp_path / "runs")
+    assert export_commands.default_name(Path("best.pt")) == "runs"
+
+
+@pytest.mark.parametrize("option", ["--name", "--version"])
+@pytest.mark.parametrize("value", ["my roads", "", "-x", "a" * 65, "a\nb"])
+def test_names_and_versions_are_short_words(tmp_path: Path, option: str, value: str) -> None:
+    result = called("any.pt", tmp_path / "out.onnx", f"{option}={value}")
+    assert result.exit_code == 2
+    assert "is not accepted" in result.output
+
+
 def test_a_folder_as_output_is_rejected(tmp_path: Path) -> None:
     assert isinstance(called("any.pt", tmp_path).exception, ExportError)
 
