@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: docs docs-serve attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture image image-test up down clean
+.PHONY: docs docs-serve attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture moving-picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -130,6 +130,10 @@ docs-serve: $(DEV_READY)
 
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
+
+# Fails if a line in it is not a lane boundary of its scene.
+moving-picture: $(DEV_READY)
+	$(BIN)/python tools/moving_picture.py docs/lanes.webp
 
 # Podman's own image format can't store a health check.
 image:

@@ -3,7 +3,7 @@
 from lanestream.protocol import CameraModel, DepartureOptions
 from lanestream_client.async_client import AsyncLaneClient, AsyncLaneStream
 from lanestream_client.client import LaneClient, LaneStream
-from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary
+from lanestream_client.frames import DetectedLanes, SourceFrame, StreamResult, StreamSummary
 from lanestream_client.sources import LiveReader, open_source
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "AsyncLaneStream",
     "CameraModel",
     "DepartureOptions",
+    "DetectedLanes",
     "LaneClient",
     "LaneStream",
     "LiveReader",

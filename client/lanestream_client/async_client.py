@@ -10,7 +10,7 @@ from contextlib import aclosing, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import httpx
 from websockets.asyncio.client import ClientConnection, connect
@@ -22,7 +22,6 @@ from lanestream.protocol import (
     CameraModel,
     DepartureOptions,
     DetectorName,
-    LanesMessage,
     Mode,
     ReadyMessage,
     WarningMessage,
@@ -38,9 +37,19 @@ from lanestream_client.endpoint import (
     websocket_errors,
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
-from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
+from lanestream_client.frames import (
+    DetectedLanes,
+    SourceFrame,
+    StreamResult,
+    StreamSummary,
+    as_source_frame,
+    as_source_frames,
+)
 from lanestream_client.oversize import smaller_image
 from lanestream_client.requests import ServiceInfo
+
+if TYPE_CHECKING:
+    from lanestream_client.pixels import BgrImage
 
 _log: Final = logging.getLogger(__name__)
 
@@ -86,37 +95,40 @@ class AsyncLaneClient:
 
     async def detect(
         self,
-        image: bytes | str | Path,
+        image: bytes | str | Path | BgrImage,
         *,
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         kinds: Sequence[BoundaryKind] | None = None,
-    ) -> LanesMessage:
-        """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, or its path.
+    ) -> DetectedLanes:
+        """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, its path, or its pixels.
 
+        Pixels are a NumPy array BGR (H, W, 3) uint8, as OpenCV reads them, and are sent as a JPEG.
         `horizon` is the row of the horizon as a share of the image height, from -0.6 (above the image) to 1, estimated
         if None. `detector` defaults to the service's. With a `camera` the lanes are also given in meters. `kinds` are
-        those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read.
+        those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read, and
+        ImageError if pixels have another type or shape.
         """
-        data = await asyncio.to_thread(requests.read_image_file, image)
+        frame = await asyncio.to_thread(requests.read_image, image)
+        data = await asyncio.to_thread(frame.encoded)
         query = partial(requests.detect_query, horizon, detector, kinds=kinds)
         try:
             return await self._detect(data, query(camera=camera))
         except ImageTooLargeError:
-            smaller = await asyncio.to_thread(smaller_image, SourceFrame(0, None, data=data))
+            smaller = await asyncio.to_thread(smaller_image, frame)
             if smaller is None:
                 raise
         _log.warning("%s", smaller.describe())
         return smaller.restore(await self._detect(smaller.data, query(camera=smaller.camera(camera))))
 
-    async def _detect(self, data: bytes, query: requests.Query) -> LanesMessage:
+    async def _detect(self, data: bytes, query: requests.Query) -> DetectedLanes:
         response = await self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
         return requests.parse_lanes(response)
 
     def stream(
         self,
-        frames: AsyncIterable[SourceFrame] | Iterable[SourceFrame | bytes],
+        frames: AsyncIterable[SourceFrame | bytes | BgrImage] | Iterable[SourceFrame | bytes | BgrImage],
         *,
         mode: Mode = "latest",
         horizon: float | None = None,
@@ -130,7 +142,7 @@ class AsyncLaneClient:
 
         A source that is not an async iterable is read in a thread, because it may block.
         """
-        source = frames if isinstance(frames, AsyncIterable) else _read_in_thread(frames)
+        source = _numbered(frames) if isinstance(frames, AsyncIterable) else _read_in_thread(frames)
         start = requests.start_message(mode, horizon, detector, camera, departure, kinds, session)
         failover = FailoverPolicy(self._endpoints, self._retry, self._timeout)
         return AsyncLaneStream(failover, source, ClientProtocol(start, in_flight=self._in_flight))
@@ -303,7 +315,15 @@ async def _cancel(task: asyncio.Task[None]) -> None:
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def _read_in_thread(frames: Iterable[SourceFrame | bytes]) -> AsyncIterator[SourceFrame]:
+async def _numbered(frames: AsyncIterable[SourceFrame | bytes | BgrImage]) -> AsyncIterator[SourceFrame]:
+    """Yields the frames of a source, as `as_source_frames` does."""
+    seq = 0
+    async for frame in frames:
+        yield frame if isinstance(frame, SourceFrame) else as_source_frame(frame, seq)
+        seq += 1
+
+
+async def _read_in_thread(frames: Iterable[SourceFrame | bytes | BgrImage]) -> AsyncIterator[SourceFrame]:
     iterator = as_source_frames(frames)
     while (frame := await asyncio.to_thread(next, iterator, None)) is not None:
         yield frame

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import httpx
 from websockets.exceptions import ConnectionClosed
@@ -23,7 +23,6 @@ from lanestream.protocol import (
     CameraModel,
     DepartureOptions,
     DetectorName,
-    LanesMessage,
     Mode,
     ReadyMessage,
     WarningMessage,
@@ -39,9 +38,12 @@ from lanestream_client.endpoint import (
     websocket_errors,
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
-from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
+from lanestream_client.frames import DetectedLanes, SourceFrame, StreamResult, StreamSummary, as_source_frames
 from lanestream_client.oversize import smaller_image
 from lanestream_client.requests import ServiceInfo
+
+if TYPE_CHECKING:
+    from lanestream_client.pixels import BgrImage
 
 _log: Final = logging.getLogger(__name__)
 
@@ -93,37 +95,39 @@ class LaneClient:
 
     def detect(
         self,
-        image: bytes | str | Path,
+        image: bytes | str | Path | BgrImage,
         *,
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         kinds: Sequence[BoundaryKind] | None = None,
-    ) -> LanesMessage:
-        """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, or its path.
+    ) -> DetectedLanes:
+        """Returns the lanes of one image: the bytes of a JPEG, PNG or WebP file, its path, or its pixels.
 
+        Pixels are a NumPy array BGR (H, W, 3) uint8, as OpenCV reads them, and are sent as a JPEG.
         `horizon` is the row of the horizon as a share of the image height, from -0.6 (above the image) to 1, estimated
         if None. `detector` defaults to the service's. With a `camera` the lanes are also given in meters. `kinds` are
-        those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read.
+        those of the boundaries to report, by default the service's. Raises SourceError if the file can't be read, and
+        ImageError if pixels have another type or shape.
         """
-        data = requests.read_image_file(image)
+        frame = requests.read_image(image)
         query = partial(requests.detect_query, horizon, detector, kinds=kinds)
         try:
-            return self._detect(data, query(camera=camera))
+            return self._detect(frame.encoded(), query(camera=camera))
         except ImageTooLargeError:
-            smaller = smaller_image(SourceFrame(0, None, data=data))
+            smaller = smaller_image(frame)
             if smaller is None:
                 raise
         _log.warning("%s", smaller.describe())
         return smaller.restore(self._detect(smaller.data, query(camera=smaller.camera(camera))))
 
-    def _detect(self, data: bytes, query: requests.Query) -> LanesMessage:
+    def _detect(self, data: bytes, query: requests.Query) -> DetectedLanes:
         response = self._request(lambda base: self._http.post(f"{base}/v1/detect", content=data, params=query))
         return requests.parse_lanes(response)
 
     def stream(
         self,
-        frames: Iterable[SourceFrame | bytes],
+        frames: Iterable[SourceFrame | bytes | BgrImage],
         *,
         mode: Mode = "latest",
         horizon: float | None = None,
@@ -135,6 +139,7 @@ class LaneClient:
     ) -> LaneStream:
         """Returns the results of one camera's frames, in frame order, as they arrive.
 
+        A frame is a SourceFrame, an image file, or its pixels, a NumPy array BGR (H, W, 3) uint8.
         `horizon`, `detector`, `camera` and `kinds` are as for `detect`; `departure` says when to warn of lane
         departures, which needs a camera; `session` is a name for the service's logs. A frame that the service refuses,
         or whose result is lost with a connection, yields a result with an `error`, and the stream continues. Raises

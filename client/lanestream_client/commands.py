@@ -6,6 +6,7 @@ The program that mounts them passes the function that loads an engine of this pr
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
@@ -35,6 +36,7 @@ from lanestream_client.failover import RetryPolicy
 from lanestream_client.frames import CameraSource, SourceCounts, SourceFrame, StreamResult
 from lanestream_client.image_files import image_files, lacks_jpeg_end, read_image_file
 from lanestream_client.in_process import InProcessClient, InProcessEngine
+from lanestream_client.preview import Preview, has_display, preview
 from lanestream_client.requests import ServiceInfo
 from lanestream_client.sinks import RunReport, json_lines_sink, video_sink
 from lanestream_client.sources import RECONNECT_CAMERA_S, LiveReader, open_source
@@ -194,6 +196,11 @@ def detect(
 )
 @click.option("--video", type=click.Path(path_type=Path), help="Write a video with lanes to this MP4 file.")
 @click.option(
+    "--show",
+    is_flag=True,
+    help="Show the newest frame with lanes in a browser on this machine, at an address that is printed.",
+)
+@click.option(
     "--fps",
     type=click.FloatRange(0.1, 1000.0),
     default=25.0,
@@ -249,6 +256,7 @@ def stream(
     jsonl: Path | None,
     mode: Mode | None,
     video: Path | None,
+    show: bool,
     fps: float,
     reconnect_camera: float,
     rtsp_transport: RtspTransport,
@@ -283,7 +291,10 @@ def stream(
             stack.enter_context(json_lines_sink(jsonl)),
             stack.enter_context(video_sink(video, frames.fps)),
             clips := stack.enter_context(departure_clips(departures_folder, record_departures, frames.fps)),
+            shown := stack.enter_context(preview(show)),
         ]
+        if shown is not None:
+            _announce(shown)
         run = _StreamRun([sink for sink in sinks if sink is not None])
         mode = mode or ("latest" if frames.live else "all")
         start = partial(
@@ -376,6 +387,14 @@ class _StreamRun:
             self._reconnects = results.reconnects
             state = "was resumed" if ready.resumed else "is new, with new track ids"
             click.echo(f"reconnected after a lost connection: session {ready.session} {state}", err=True)
+
+
+def _announce(shown: Preview) -> None:
+    """Prints where the preview is, and opens it if this machine has a display."""
+    click.echo(f"preview: {shown.url}", err=True)
+    if has_display():
+        # Some systems return from this only when the browser is closed.
+        threading.Thread(target=partial(click.launch, shown.url, wait=True), name="browser", daemon=True).start()
 
 
 @contextmanager

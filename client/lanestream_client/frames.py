@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from lanestream.errors import ImageError, needs_extra
 from lanestream.protocol import ErrorMessage, Indicator, LanesMessage
+from lanestream_client.pixels import check_pixels, encode_jpeg
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    BgrImage = NDArray[np.uint8]  # (H, W, 3)
+    from lanestream_client.pixels import BgrImage
 
 # Where a capture time is from: the file or the camera itself, the arrival of the frame here, or only the number of the
 # frame and the frame rate.
@@ -27,9 +25,12 @@ _JPEG_QUALITY: Final = 90
 class SourceFrame:
     """A frame as its source delivers it: an image file in `data`, or decoded `pixels`, BGR (H, W, 3) uint8.
 
+    The order of the colors is that of OpenCV and of PyAV's format `bgr24`; RGB pixels become BGR with `rgb[..., ::-1]`.
     `timestamp` is the capture time in seconds on the source's clock. If it is None, the receiver assigns one. `speed`
     in m/s and `indicator` are the vehicle's then, for lane departure warnings. `clock` says where the capture time is
     from, and `reconnects` how often the source had been lost and opened again before this frame.
+
+    Raises ImageError if `pixels` has another type or shape.
     """
 
     seq: int
@@ -42,16 +43,20 @@ class SourceFrame:
     clock: Clock | None = None
     reconnects: int = 0
 
+    def __post_init__(self) -> None:
+        if self.pixels is not None:
+            check_pixels(self.pixels)
+
     def encoded(self) -> bytes:
-        """Returns the frame as an image file: the original file, or a JPEG of `pixels`."""
+        """Returns the frame as an image file: the original file, or a JPEG of `pixels`.
+
+        Raises ImageError if the image is too large for a JPEG.
+        """
         if self.data is not None:
             return self.data
-        with needs_extra("video"):
-            import cv2
         if self.pixels is None:
             return b""
-        _, encoded = cv2.imencode(".jpg", self.pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        return encoded.tobytes()
+        return encode_jpeg(self.pixels, _JPEG_QUALITY)
 
     def image(self) -> BgrImage:
         """Returns the frame's pixels, BGR (H, W, 3) uint8. Raises ImageError if its file can't be decoded."""
@@ -104,6 +109,36 @@ class StreamResult:
     lanes: LanesMessage | None = None
     error: ErrorMessage | None = None
 
+    def draw(self, frame: BgrImage | None = None) -> BgrImage:
+        """Returns a picture of the frame with its lanes, or with its error written on it: BGR (H, W, 3) uint8.
+
+        Draws on a copy of `frame`, BGR (H, W, 3) uint8 of the same size, if given. Raises ImageError if the frame can't
+        be decoded, or if `frame` does not fit, and MissingExtraError without `lanestream[video]`.
+        """
+        from lanestream_client.overlays import draw_error, draw_lanes
+
+        if frame is not None:
+            check_pixels(frame, None if self.lanes is None else (self.lanes.width, self.lanes.height))
+        image = self.frame.image() if frame is None else frame
+        if self.lanes is not None:
+            return draw_lanes(image, self.lanes)
+        return image.copy() if self.error is None else draw_error(image, self.error)
+
+
+class DetectedLanes(LanesMessage):
+    """The lanes of a single image, as `detect` returns them."""
+
+    def draw(self, image: BgrImage) -> BgrImage:
+        """Returns a copy of `image`, BGR (H, W, 3) uint8, with these lanes drawn on it.
+
+        Raises ImageError if `image` does not have the size of the image that was sent, and MissingExtraError without
+        `lanestream[video]`.
+        """
+        from lanestream_client.overlays import draw_lanes
+
+        check_pixels(image, (self.width, self.height))
+        return draw_lanes(image, self)
+
 
 @dataclass(frozen=True)
 class StreamSummary:
@@ -122,7 +157,14 @@ class StreamSummary:
     duration_s: float
 
 
-def as_source_frames(frames: Iterable[SourceFrame | bytes]) -> Iterator[SourceFrame]:
-    """Yields the frames of a source. Numbers plain image files from 0 and leaves their capture times unset."""
+def as_source_frames(frames: Iterable[SourceFrame | bytes | BgrImage]) -> Iterator[SourceFrame]:
+    """Yields the frames of a source. Numbers image files and pixels from 0 and leaves their capture times unset."""
     for seq, frame in enumerate(frames):
-        yield frame if isinstance(frame, SourceFrame) else SourceFrame(seq, None, data=frame)
+        yield frame if isinstance(frame, SourceFrame) else as_source_frame(frame, seq)
+
+
+def as_source_frame(image: bytes | BgrImage, seq: int = 0) -> SourceFrame:
+    """Returns the frame of an image file or of BGR pixels (H, W, 3) uint8. Raises ImageError if it is neither."""
+    if isinstance(image, bytes):
+        return SourceFrame(seq, None, data=image)
+    return SourceFrame(seq, None, pixels=image)

@@ -24,10 +24,10 @@ from lanestream.protocol import (
     error_message,
 )
 from lanestream_client.frames import SourceFrame, StreamResult, StreamSummary, as_source_frames
-from lanestream_client.requests import ServiceInfo, read_image_file
+from lanestream_client.requests import ServiceInfo, read_image
 
 if TYPE_CHECKING:
-    from lanestream_client.frames import BgrImage
+    from lanestream_client.pixels import BgrImage
 
 
 class ResultStream(Protocol):
@@ -65,19 +65,19 @@ class LaneService(Protocol):
 
     def detect(
         self,
-        image: bytes | str | Path,
+        image: bytes | str | Path | BgrImage,
         *,
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         kinds: Sequence[BoundaryKind] | None = None,
     ) -> LanesMessage:
-        """Returns the lanes of one image file."""
+        """Returns the lanes of one image, a file or BGR pixels (H, W, 3) uint8."""
         ...
 
     def stream(
         self,
-        frames: Iterable[SourceFrame | bytes],
+        frames: Iterable[SourceFrame | bytes | BgrImage],
         *,
         mode: Mode = "latest",
         horizon: float | None = None,
@@ -172,20 +172,21 @@ class InProcessClient:
 
     def detect(
         self,
-        image: bytes | str | Path,
+        image: bytes | str | Path | BgrImage,
         *,
         horizon: float | None = None,
         detector: DetectorName | None = None,
         camera: CameraModel | None = None,
         kinds: Sequence[BoundaryKind] | None = None,
     ) -> LanesMessage:
-        """Returns the lanes of one image file. Raises ImageError, SourceError and NoDetectorError."""
+        """Returns the lanes of one image. Raises ImageError, SourceError and NoDetectorError."""
         session = self._engine.open_camera(horizon, detector, camera, kinds=kinds, single_image=True)
-        return session.lanes(read_image_file(image), seq=0, timestamp=0.0)
+        frame = read_image(image)
+        return session.lanes(frame.encoded() if frame.pixels is None else frame.pixels, seq=0, timestamp=0.0)
 
     def stream(
         self,
-        frames: Iterable[SourceFrame | bytes],
+        frames: Iterable[SourceFrame | bytes | BgrImage],
         *,
         mode: Mode = "latest",
         horizon: float | None = None,

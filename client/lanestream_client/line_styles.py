@@ -1,11 +1,11 @@
-"""How boundaries are drawn: their shape shows what they are, their color where they are."""
+"""How boundaries are drawn: their shape shows what they are, their color where they are, their opacity how sure."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lanestream_client.drawing import DARK, WHITE, Color, position_color
+from lanestream_client.colors import WHITE, YELLOW, Color, position_color
 
 if TYPE_CHECKING:
     from lanestream.protocol import LaneModel
@@ -13,13 +13,18 @@ if TYPE_CHECKING:
 # The start and the end of a painted piece of a line, as shares of its length.
 Piece = tuple[float, float]
 
-_YELLOW: Final[Color] = (0, 235, 255)
 # The number of dashes of a boundary, and the share of a dash and its gap that is painted: of continuous lines by state,
 # and of those that are interrupted on the road.
 _BY_STATE: Final[dict[str, tuple[int, float]]] = {"detected": (1, 1.0), "inferred": (4, 0.8), "predicted": (8, 0.5)}
 _BY_TYPE: Final[dict[str, tuple[int, float]]] = {"dashed": (7, 0.5), "dots": (18, 0.3)}
-# How much of its color a boundary keeps that was not detected.
-_STRENGTH: Final[dict[str, float]] = {"detected": 1.0, "inferred": 0.85, "predicted": 0.6}
+# The opacity of boundaries by state: near the vehicle, and at the far end, where they are least certain.
+_OPACITY: Final[dict[str, tuple[float, float]]] = {
+    "detected": (1.0, 0.5),
+    "inferred": (0.8, 0.3),
+    "predicted": (0.6, 0.1),
+}
+# The share of the opacity that is left of boundaries with these probabilities.
+_PROBABILITIES, _SHARES = (0.5, 0.85), (0.4, 1.0)
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,8 @@ class LineStyle:
     """The shape and the color of a line.
 
     A line with a `core` has a narrow stripe of that color along its middle. `ticks` is the side of the short ticks that
-    mark a road edge, -1 left and 1 right, away from the vehicle; 0 if there are none.
+    mark a road edge, -1 left and 1 right, away from the vehicle; 0 if there are none. `near_opacity` applies to its
+    near part and `far_opacity` to its far end.
     """
 
     pieces: tuple[Piece, ...]
@@ -48,24 +54,30 @@ class LineStyle:
     color: Color
     core: Color | None
     ticks: int
+    near_opacity: float
+    far_opacity: float
 
 
 def line_style(lane: LaneModel) -> LineStyle:
     """Returns how a boundary is drawn.
 
     Markings have the color of their position, and road edges are white. Without a known type, a marking is drawn
-    as a solid one.
+    as a solid one. Boundaries that are barely probable are faint, and those that were not detected are paler and fade
+    sooner.
     """
     is_edge, marking = lane.kind == "road_edge", lane.marking
     marking_type = "solid" if marking is None else marking.type
-    strength = _STRENGTH[lane.state]
+    share = _share_of_opacity(lane.probability)
+    near, far = _OPACITY[lane.state]
     is_yellow = marking is not None and marking.color == "yellow"
     return LineStyle(
         pieces=_pieces(*_BY_TYPE.get(marking_type, _BY_STATE[lane.state])),
         strands=_THIN if is_edge else _DOUBLE if marking_type == "double" else _SINGLE,
-        color=_faded(WHITE if is_edge else position_color(lane.position), strength),
-        core=_faded(_YELLOW, strength) if is_yellow else None,
+        color=WHITE if is_edge else position_color(lane.position),
+        core=YELLOW if is_yellow else None,
         ticks=0 if not is_edge else 1 if lane.position > 0 else -1,
+        near_opacity=share * near,
+        far_opacity=share * far,
     )
 
 
@@ -81,6 +93,7 @@ def _pieces(count: int, painted: float) -> tuple[Piece, ...]:
     return tuple((start / length, (start + painted) / length) for start in range(count))
 
 
-def _faded(color: Color, strength: float) -> Color:
-    blue, green, red = (round(strength * c + (1.0 - strength) * dark) for c, dark in zip(color, DARK, strict=True))
-    return blue, green, red
+def _share_of_opacity(probability: float) -> float:
+    """Returns the share of the opacity for a probability."""
+    (low, high), (least, most) = _PROBABILITIES, _SHARES
+    return least + (most - least) * min(1.0, max(0.0, (probability - low) / (high - low)))

@@ -1,9 +1,9 @@
-"""Draws lanes on their image: the ego lane as an area, boundaries as ribbons that taper with distance.
+"""Draws lanes on their image: the ego lane as an area, boundaries as ribbons that taper and fade with distance.
 
 Colors show positions, and shapes what a boundary is: a dashed marking is drawn with dashes, a double one as two lines,
 raised dots as dots, a yellow one with a yellow core, and a road edge as a thin white line with ticks away from the
-vehicle. A boundary that was not detected in the frame is paler. If its line is continuous, it has long dashes if it is
-inferred, and short ones if it is predicted. Sizes scale with the image.
+vehicle. A boundary that is barely probable is faint. One that was not detected in the frame is paler; if its line is
+continuous, it has long dashes if it is inferred, and short ones if it is predicted. Sizes scale with the image.
 """
 
 from __future__ import annotations
@@ -12,9 +12,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import needs_extra
-from lanestream_client.drawing import ALERT, DARK, WHITE, Color, Drawing, position_color, position_name
-from lanestream_client.line_styles import Strand, line_name, line_style
-from lanestream_client.road_panel import draw_road_panel
+from lanestream_client.colors import ALERT, DARK, EGO_LANE, Color
+from lanestream_client.drawing import Drawing
+from lanestream_client.ego_lane import columns, ego_boundaries, ego_lane_outline
+from lanestream_client.labels import STEP, draw_labels, draw_legend
+from lanestream_client.line_styles import LineStyle, Strand, line_style
+from lanestream_client.road_panel import draw_road_panel, panel_width
 
 with needs_extra("video"):
     import numpy as np
@@ -23,70 +26,105 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lanestream.protocol import ErrorMessage, LaneModel, LanesMessage
-    from lanestream_client.frames import BgrImage
+    from lanestream_client.pixels import BgrImage
 
     FloatArray = NDArray[np.float64]
 
-_EGO_LANE: Final[Color] = (150, 220, 60)
 _SAMPLES: Final = 64  # points along an outline
 _FORESHORTENING: Final = 1.6
 _CORE: Final = 0.5  # the width of a core, in widths of its line
 _TICKS: Final = 12  # along a road edge
 _TICK_LENGTH: Final = 6.0  # in half widths of a line
+_MARGIN: Final = 48.0  # pixels around a boundary that its ribbon and its ticks may cover
+# The opacity of the ego lane at shares of its rows from the farthest to the nearest. It fades with distance, and just
+# in front of the vehicle, where the hood may hide the road.
+_LANE_ROWS: Final = (0.0, 0.35, 0.6, 1.0)
+_LANE_OPACITY: Final = (0.02, 0.28, 0.34, 0.0)
+# The share of the rows of a boundary, from its far end, in which it fades.
+_FADING: Final = 0.45
 
 
 def draw_lanes(image: BgrImage, message: LanesMessage) -> BgrImage:
     """Returns a copy of `image`, BGR (H, W, 3) uint8, with the lanes of `message` drawn on it."""
     drawing = Drawing.on_copy_of(image)
-    _draw_ego_lane(drawing, message)
-    for lane in message.lanes:
-        _draw_ribbon(drawing, lane)
-    for lane in message.lanes:
-        _draw_label(drawing, lane)
-    _draw_legend(drawing, message)
-    draw_road_panel(drawing, message)
+    layer = drawing.copy()
+    _draw_ego_lane(drawing, layer, message)
+    for lane in sorted(message.lanes, key=lambda lane: -abs(lane.position)):
+        _draw_boundary(drawing, layer, lane)
+    room = image.shape[1] - panel_width(drawing, message)
+    boxes = [draw_legend(drawing, message, room), *draw_road_panel(drawing, message)]
+    draw_labels(drawing, message.lanes, [box for box in boxes if box is not None])
     return drawing.image
 
 
 def draw_error(image: BgrImage, error: ErrorMessage) -> BgrImage:
     """Returns a copy of `image`, BGR (H, W, 3) uint8, with the error message written on it."""
     drawing = Drawing.on_copy_of(image)
-    step = 26 * drawing.scale
-    text = f"frame {error.seq}: {error.message}"
-    drawing.part(step / 2, step / 2, drawing.text_width(text) + step, 1.5 * step).darken()
-    drawing.text(text, (step, 1.45 * step), ALERT)
+    step = STEP * drawing.text_scale
+    lines = _wrapped(drawing, f"frame {error.seq}: {error.message}", image.shape[1] - 2.0 * step)
+    width = max(drawing.text_width(line) for line in lines)
+    drawing.part(step / 2, step / 2, width + step, (0.5 + len(lines)) * step).darken()
+    for number, line in enumerate(lines):
+        drawing.text(line, (step, (1.25 + number) * step), ALERT)
     return drawing.image
 
 
-def _columns(lane: LaneModel, rows: FloatArray) -> FloatArray:
-    return np.array([lane.x(float(row)) for row in rows])
+def _wrapped(drawing: Drawing, text: str, width: float) -> list[str]:
+    """Returns the lines of a text, none of which is wider than `width` pixels unless a single word is."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and drawing.text_width(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
 
 
-def _draw_ego_lane(drawing: Drawing, message: LanesMessage) -> None:
-    """Fills the ego lane with a color that fades with distance."""
-    by_id = {lane.track_id: lane for lane in message.lanes}
-    left, right = by_id.get(message.ego.left or -1), by_id.get(message.ego.right or -1)
-    if left is None or right is None:
+def _draw_ego_lane(drawing: Drawing, layer: Drawing, message: LanesMessage) -> None:
+    """Fills the ego lane with a color that fades with distance. `layer` is a copy of the image, and is again later."""
+    boundaries, outline = ego_boundaries(message), ego_lane_outline(message)
+    if boundaries is None or outline is None:
         return
-    bottom = min(left.line.bottom[1], right.line.bottom[1])
-    top = max(left.line.top[1], right.line.top[1])
+    bottom, top = float(outline[:, 1].max()), float(outline[:, 1].min())
     if bottom - top < 2.0:
         return
-    rows = np.linspace(bottom, top, _SAMPLES)
-    outline = np.vstack(
-        [np.column_stack([_columns(left, rows), rows]), np.column_stack([_columns(right, rows), rows])[::-1]]
-    )
-    filled = Drawing(drawing.image.copy(), drawing.scale)
-    filled.polygon(outline, _EGO_LANE)
-    band = slice(max(0, int(top) - 1), int(bottom) + 2)
-    under, over = drawing.image[band], filled.image[band]
-    alpha = np.interp(np.arange(band.start, band.start + len(under)), [top, bottom], [0.08, 0.38])[:, None, None]
-    under[:] = (under + alpha * (over.astype(np.float32) - under)).astype(np.uint8)
+    layer.polygon(outline, EGO_LANE)
+    opacity = np.array(_LANE_OPACITY) * min(line_style(lane).near_opacity for lane in boundaries)
+    _blend(drawing, layer, outline, 2.0, top + np.array(_LANE_ROWS) * (bottom - top), opacity)
 
 
-def _draw_ribbon(drawing: Drawing, lane: LaneModel) -> None:
-    """Draws a boundary in its style. A dark rim keeps it visible on bright concrete."""
-    style, rim = line_style(lane), 1.3 * drawing.scale
+def _draw_boundary(drawing: Drawing, layer: Drawing, lane: LaneModel) -> None:
+    """Draws a boundary in its style. `layer` is a copy of the image, and is again later."""
+    style = line_style(lane)
+    _draw_ribbon(layer, lane, style)
+    bottom, top = lane.line.bottom[1], lane.line.top[1]
+    rows = np.linspace(top, bottom, _SAMPLES)
+    shares = np.array([0.0, _FADING, 1.0])
+    opacity = np.array([style.far_opacity, style.near_opacity, style.near_opacity])
+    outline = np.column_stack([columns(lane, rows), rows])
+    _blend(drawing, layer, outline, _MARGIN * drawing.scale, top + shares * (bottom - top), opacity)
+
+
+def _blend(
+    drawing: Drawing, layer: Drawing, outline: FloatArray, margin: float, rows: FloatArray, opacity: FloatArray
+) -> None:
+    """Blends what was drawn on `layer` within `margin` pixels of `outline` (N, 2) into the image, then removes it.
+
+    The opacity of a row is interpolated between `opacity` (N,) at the ascending `rows` (N,).
+    """
+    size = np.array([drawing.image.shape[1], drawing.image.shape[0]])
+    left, top = np.clip(np.floor(outline.min(axis=0) - margin), 0, size).astype(int)
+    right, bottom = np.clip(np.ceil(outline.max(axis=0) + margin), 0, size).astype(int)
+    under = drawing.part(left, top, right - left, bottom - top)
+    over = layer.part(left, top, right - left, bottom - top)
+    under.blend(over, rows - top, opacity)
+    over.image[:] = under.image
+
+
+def _draw_ribbon(drawing: Drawing, lane: LaneModel, style: LineStyle) -> None:
+    """Draws a boundary as ribbons. A dark rim keeps them visible on bright concrete."""
+    rim = 1.3 * drawing.scale
     if style.ticks:
         _draw_ticks(drawing, lane, style.color, style.ticks)
     for piece in style.pieces:
@@ -114,11 +152,11 @@ def _half_widths(drawing: Drawing, lane: LaneModel, rows: FloatArray) -> FloatAr
 def _fill_ribbon(
     drawing: Drawing, lane: LaneModel, rows: FloatArray, strand: Strand, color: Color, rim: float = 0.0
 ) -> None:
-    columns = _columns(lane, rows)
+    middles = columns(lane, rows)
     # The width is measured across the ribbon, not along the row, so that oblique boundaries do not shrink to hairlines.
-    obliquity = np.minimum(3.0, np.hypot(1.0, np.gradient(columns, rows)))
+    obliquity = np.minimum(3.0, np.hypot(1.0, np.gradient(middles, rows)))
     half = _half_widths(drawing, lane, rows)
-    middle = columns + 2.0 * strand.middle * half * obliquity
+    middle = middles + 2.0 * strand.middle * half * obliquity
     reach = (strand.width * half + rim) * obliquity
     left, right = np.column_stack([middle - reach, rows]), np.column_stack([middle + reach, rows])
     drawing.polygon(np.vstack([left, right[::-1]]), color)
@@ -127,44 +165,7 @@ def _fill_ribbon(
 def _draw_ticks(drawing: Drawing, lane: LaneModel, color: Color, side: int) -> None:
     """Draws short ticks along a road edge, away from the vehicle."""
     rows = _rows(lane, (np.arange(_TICKS) + 0.5) / _TICKS)
-    for row, column, half in zip(rows, _columns(lane, rows), _half_widths(drawing, lane, rows), strict=True):
+    for row, column, half in zip(rows, columns(lane, rows), _half_widths(drawing, lane, rows), strict=True):
         for height, tick_color in ((0.4 * half + 1.3 * drawing.scale, DARK), (0.4 * half, color)):
             end = column + side * _TICK_LENGTH * half
             drawing.rectangle(min(column, end), row - height, abs(end - column), 2.0 * height, tick_color)
-
-
-def _draw_label(drawing: Drawing, lane: LaneModel) -> None:
-    """Writes the track id on a small label, a third of the way up the boundary."""
-    row = lane.line.bottom[1] + 0.3 * (lane.line.top[1] - lane.line.bottom[1])
-    column = float(_columns(lane, np.array([row]))[0])
-    text = str(lane.track_id)
-    width, height = drawing.text_width(text) + 14 * drawing.scale, 24 * drawing.scale
-    left = min(max(0.0, column - width / 2), drawing.image.shape[1] - width)
-    corners = np.array([[left, row], [left + width, row], [left + width, row + height], [left, row + height]])
-    drawing.polygon(corners, DARK)
-    inset = 2 * drawing.scale
-    drawing.polygon(corners + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), position_color(lane.position))
-    drawing.text(text, (left + 7 * drawing.scale, row + 17.5 * drawing.scale), DARK)
-
-
-def _draw_legend(drawing: Drawing, message: LanesMessage) -> None:
-    """Writes the frame number and the latency, then the positions of the boundaries in their colors."""
-    step = 26 * drawing.scale
-    title = f"frame {message.seq}   {message.timing_ms.total:.1f} ms"
-    entries = [(_legend_text(lane), lane.position) for lane in message.lanes]
-    swatch = 1.1 * step
-    width = (
-        max([drawing.text_width(title), *(swatch + drawing.text_width(text, 0.5) for text, _ in entries)]) + 1.2 * step
-    )
-    drawing.part(step / 2, step / 2, width, (1.5 + len(entries)) * step).darken()
-    drawing.text(title, (1.1 * step, 1.5 * step), WHITE)
-    for line, (text, position) in enumerate(entries, 1):
-        middle = (1.3 + line) * step
-        bar = np.array([[1.1, -0.12], [1.9, -0.12], [1.9, 0.12], [1.1, 0.12]]) * step + np.array([0.0, middle])
-        drawing.polygon(bar, position_color(position))
-        drawing.text(text, (1.1 * step + swatch, middle + 0.2 * step), WHITE, 0.5)
-
-
-def _legend_text(lane: LaneModel) -> str:
-    parts = [position_name(lane.position), line_name(lane), "" if lane.state == "detected" else lane.state]
-    return ", ".join(part for part in parts if part)

@@ -9,13 +9,15 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from lanestream.protocol import CameraModel, LaneModel, LanesMessage, LineModel, Point
 from lanestream_client.frames import SourceFrame
 
 if TYPE_CHECKING:
     from lanestream.protocol import Limits
+
+_Lanes = TypeVar("_Lanes", bound=LanesMessage)
 
 # The most pixels of an image that is scaled down: detectors use images 640 pixels wide.
 _SENT_PIXELS: Final = 1920 * 1080
@@ -39,7 +41,7 @@ class SmallerImage:
             return camera
         return camera.model_copy(update={"image_size": self.original})
 
-    def restore(self, message: LanesMessage) -> LanesMessage:
+    def restore(self, message: _Lanes) -> _Lanes:
         """Returns the lanes of this image in pixels of the original one."""
         width, height = self.original
         lanes = [self._restore_lane(lane) for lane in message.lanes]

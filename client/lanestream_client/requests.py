@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import httpx
 from pydantic import ValidationError
@@ -19,13 +20,16 @@ from lanestream.protocol import (
     CameraModel,
     DepartureOptions,
     DetectorName,
-    LanesMessage,
     Mode,
     StartMessage,
     parse_client_message,
 )
 from lanestream_client import image_files
 from lanestream_client.endpoint import Endpoint, refusal_error
+from lanestream_client.frames import DetectedLanes, SourceFrame, as_source_frame
+
+if TYPE_CHECKING:
+    from lanestream_client.pixels import BgrImage
 
 Query = dict[str, float | str | list[str]]
 
@@ -38,12 +42,12 @@ class ServiceInfo:
     provider: str
 
 
-def read_image_file(image: bytes | str | Path) -> bytes:
-    """Returns `image` if it is the file's content, else reads the file at that path.
+def read_image(image: bytes | str | Path | BgrImage) -> SourceFrame:
+    """Returns the frame of an image file, its content or its path, or of BGR pixels (H, W, 3) uint8.
 
-    Raises SourceError if the file can't be read.
+    Raises SourceError if the file can't be read, and ImageError if pixels have another type or shape.
     """
-    return image if isinstance(image, bytes) else image_files.read_image_file(Path(image))
+    return as_source_frame(image_files.read_image_file(Path(image)) if isinstance(image, str | Path) else image)
 
 
 def detect_query(
@@ -108,10 +112,10 @@ def check_response(response: httpx.Response, endpoint: Endpoint) -> httpx.Respon
     raise refusal_error(response.status_code, response.content, endpoint)
 
 
-def parse_lanes(response: httpx.Response) -> LanesMessage:
+def parse_lanes(response: httpx.Response) -> DetectedLanes:
     """Returns the lanes in a response of `/v1/detect`. Raises ProtocolError if it is not valid."""
     try:
-        return LanesMessage.model_validate_json(response.content)
+        return DetectedLanes.model_validate_json(response.content)
     except ValidationError:
         raise ProtocolError("the service sent a response that is not a `lanes` message") from None
 

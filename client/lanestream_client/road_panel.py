@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from lanestream.errors import needs_extra
-from lanestream_client.drawing import ALERT, CAUTION, WHITE, Color, Drawing, position_color
+from lanestream_client.colors import ALERT, CAUTION, GRAY, WHITE, Color, faded, position_color
 from lanestream_client.line_styles import line_style
 
 with needs_extra("video"):
@@ -18,16 +18,22 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lanestream.protocol import DepartureModel, EgoModel, LaneModel, LanesMessage
+    from lanestream_client.drawing import Drawing
+    from lanestream_client.labels import Box
 
     FloatArray = NDArray[np.float64]
 
-# All sizes are in pixels of an image 1280 pixels wide.
+# All sizes are in pixels of an image of 1280 x 720.
 _STEP: Final = 26.0
 _WIDTH: Final = 262.0
 _MAP_WIDTH: Final = 150.0
 _MAP_HEIGHT: Final = 230.0
 # In narrower images, there is no room beside the legend.
-_LEAST_WIDTH: Final = 700.0
+_LEAST_WIDTH: Final = 480.0
+_LEAST_WIDTH_FOR_MAP: Final = 800.0
+# The readings and the map take at most these shares of the height.
+_MOST_HEIGHT: Final = 0.32
+_MOST_HEIGHT_OF_MAP: Final = 0.6
 # The part of the road that the map shows in meters: ahead, behind and on either side of the vehicle.
 _AHEAD_M: Final = 45.0
 _BEHIND_M: Final = 5.0
@@ -44,53 +50,79 @@ _SIGMAS: Final = 1.96
 _BAR_LANES: Final = 0.62
 # Weaker curvatures, in 1/m, count as straight.
 _STRAIGHT: Final = 1.0 / 3000.0
-_GRAY: Final[Color] = (150, 150, 150)
 
 
-def draw_road_panel(drawing: Drawing, message: LanesMessage) -> None:
+def panel_width(drawing: Drawing, message: LanesMessage) -> float:
+    """Returns how many pixels at the right of the image the panel takes with its margins; 0 if it is not drawn."""
+    readings, road = _readings_width(drawing, message), _map_width(drawing, message)
+    gaps = (readings > 0.0) + (road > 0.0)
+    return readings + road + 0.5 * gaps * _STEP * drawing.text_scale
+
+
+def draw_road_panel(drawing: Drawing, message: LanesMessage) -> list[Box]:
     """Draws the panel at the top right, and the map of the road beside it if the camera is known.
 
-    Draws nothing on an image that is too narrow.
+    Leaves out what an image is too small for. Returns the boxes that it takes.
     """
-    if drawing.image.shape[1] < _LEAST_WIDTH * drawing.scale:
-        return
-    right = drawing.image.shape[1] - _STEP / 2.0 * drawing.scale
-    grounds = [lane for lane in message.lanes if lane.ground is not None]
-    if grounds:
-        width, height = _MAP_WIDTH * drawing.scale, _MAP_HEIGHT * drawing.scale
-        right -= width
-        part = drawing.part(right, _STEP / 2.0 * drawing.scale, width, height)
+    gap = 0.5 * _STEP * drawing.text_scale
+    right = drawing.image.shape[1] - gap
+    boxes = []
+    if width := _map_width(drawing, message):
+        height = _MAP_HEIGHT * drawing.text_scale
+        boxes.append((right - width, gap, right, gap + height))
+        part = drawing.part(right - width, gap, width, height)
         part.darken()
-        _draw_map(part, grounds)
-        right -= 0.4 * _STEP * drawing.scale
-    if message.ego.offset is not None or message.departure is not None:
-        _draw_readings(drawing, right, message.ego, message.departure)
+        _draw_map(part, [lane for lane in message.lanes if lane.ground is not None])
+        right -= width + gap
+    if width := _readings_width(drawing, message):
+        height = _draw_readings(drawing, right - width, gap, message.ego, message.departure)
+        boxes.append((right - width, gap, right, gap + height))
+    return boxes
 
 
-def _draw_readings(drawing: Drawing, right: float, ego: EgoModel, departure: DepartureModel | None) -> None:
-    """Draws the offset bar and lines of text that end at the column `right`."""
-    step, width = _STEP * drawing.scale, _WIDTH * drawing.scale
+def _map_width(drawing: Drawing, message: LanesMessage) -> float:
+    height, width = drawing.image.shape[:2]
+    scale = drawing.text_scale
+    has_room = width >= _LEAST_WIDTH_FOR_MAP * scale and _MAP_HEIGHT * scale <= _MOST_HEIGHT_OF_MAP * height
+    known = any(lane.ground is not None for lane in message.lanes)
+    return _MAP_WIDTH * drawing.text_scale if known and has_room else 0.0
+
+
+def _readings_width(drawing: Drawing, message: LanesMessage) -> float:
+    has_room = drawing.image.shape[1] >= _LEAST_WIDTH * drawing.text_scale
+    known = message.ego.offset is not None or message.departure is not None
+    return _WIDTH * drawing.text_scale if known and has_room else 0.0
+
+
+def _draw_readings(drawing: Drawing, left: float, top: float, ego: EgoModel, departure: DepartureModel | None) -> float:
+    """Draws the offset bar and lines of text with the upper left corner at `left`, `top`. Returns their height."""
+    step, width = _STEP * drawing.text_scale, _WIDTH * drawing.text_scale
     texts = [(_offset_text(ego), WHITE), *((text, WHITE) for text in _road_texts(ego))]
     if departure is not None:
         texts.append(_departure_text(departure))
-    part = drawing.part(right - width, step / 2.0, width, (1.4 + len(texts)) * step)
+    # In a small image, what lies between the offset and the departure has no room.
+    while len(texts) > 2 and (1.4 + len(texts)) * step > _MOST_HEIGHT * drawing.image.shape[0]:
+        del texts[-2]
+    height = (1.4 + len(texts)) * step
+    part = drawing.part(left, top, width, height)
     part.darken()
     color = WHITE if departure is None else _departure_text(departure)[1]
     if ego.offset is not None:
         _draw_offset_bar(part, ego.offset, ego.offset_sigma or 0.0, color)
     for line, (text, text_color) in enumerate(texts, 2):
         part.text(text, (0.5 * step, (line - 0.1) * step), text_color, 0.5)
+    return height
 
 
 def _draw_offset_bar(drawing: Drawing, offset: float, sigma: float, color: Color) -> None:
     """Draws the lane as a bar between its boundaries, and the vehicle's middle at `offset` lane widths in it."""
-    step, width = _STEP * drawing.scale, _WIDTH * drawing.scale
+    step, width = _STEP * drawing.text_scale, _WIDTH * drawing.text_scale
     middle, lane = 0.7 * step, 0.78 * width
 
     def column(share: float) -> float:
         return width / 2.0 + min(max(share, -_BAR_LANES), _BAR_LANES) * lane
 
-    drawing.rectangle(column(-0.5), middle - 0.06 * step, lane, 0.12 * step, _GRAY)
+    drawing.rectangle(column(-0.5), middle - 0.06 * step, lane, 0.12 * step, GRAY)
     for edge, position in ((-0.5, -1), (0.5, 1)):
         drawing.rectangle(
             column(edge) - 0.09 * step, middle - 0.35 * step, 0.18 * step, 0.7 * step, position_color(position)
@@ -150,16 +182,16 @@ def _draw_map(drawing: Drawing, lanes: list[LaneModel]) -> None:
     """Draws boundaries from above, ahead is up, with their uncertainty as bands; fills the image."""
     height, width = drawing.image.shape[:2]
     for distance in _GRID_M:
-        drawing.line(
-            _map_points(np.array([distance] * 2), np.array([-_SIDE_M, _SIDE_M]), width, height), (80, 76, 72), 1.0
-        )
-        if distance in _GRID_M[1::2]:
-            (at,) = _map_points(np.array([distance]), np.array([_SIDE_M]), width, height)
-            drawing.text(f"{distance:.0f} m", (at[0] + 3.0 * drawing.scale, at[1] - 3.0 * drawing.scale), _GRAY, 0.36)
+        across = _map_points(np.array([distance] * 2), np.array([-_SIDE_M, _SIDE_M]), width, height)
+        drawing.line(across, (80, 76, 72), 1.0)
     for lane in lanes:
         _draw_band(drawing, lane)
     for lane in lanes:
         _draw_line(drawing, lane)
+    inset = 3.0 * drawing.text_scale
+    for distance in _GRID_M[1::2]:
+        (at,) = _map_points(np.array([distance]), np.array([_SIDE_M]), width, height)
+        drawing.text(f"{distance:.0f} m", (at[0] + inset, at[1] - inset), GRAY, 0.4)
     length, breadth = _VEHICLE_M
     corners = np.array([[-length, breadth], [0.0, breadth], [0.0, -breadth], [-length, -breadth]]) / np.array(
         [1.0, 2.0]
@@ -171,18 +203,19 @@ def _draw_line(drawing: Drawing, lane: LaneModel) -> None:
     """Draws a boundary in its style."""
     height, width = drawing.image.shape[:2]
     style = line_style(lane)
+    color = faded(style.color, style.near_opacity)
     for start, end in style.pieces:
         x = np.linspace(start * _AHEAD_M, end * _AHEAD_M, _SAMPLES)
         for strand in style.strands:
             points = _map_points(x, _lateral(lane, x) - strand.middle * _LINE_M, width, height)
-            drawing.line(points, style.color, 2.0 * strand.width)
+            drawing.line(points, color, 2.0 * strand.width)
             if style.core is not None:
-                drawing.line(points, style.core, 1.0)
+                drawing.line(points, faded(style.core, style.near_opacity), 1.0)
     if style.ticks:
         for at in np.arange(1.0, _AHEAD_M, _TICKS_M):
             x = np.array([at, at])
             y = _lateral(lane, x) - np.array([0.0, style.ticks * _TICK_M])
-            drawing.line(_map_points(x, y, width, height), style.color, 1.0)
+            drawing.line(_map_points(x, y, width, height), color, 1.0)
 
 
 def _draw_band(drawing: Drawing, lane: LaneModel) -> None:

@@ -1,6 +1,7 @@
 """Where the results of a command go: lines of JSON, video files, and the report at the end.
 
-To add a sink, write a class with the method of `ResultSink` here and add its option in commands.py.
+To add a sink, write a class with the method of `ResultSink`, here or in its own module, and add its option in
+commands.py.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     import av
 
     from lanestream.protocol import LanesMessage
-    from lanestream_client.frames import BgrImage, SourceCounts, StreamResult
+    from lanestream_client.frames import SourceCounts, StreamResult
+    from lanestream_client.pixels import BgrImage
     from lanestream_client.requests import ServiceInfo
 
 # The frame times of 24, 25, 29.97, 30, 50 and 60 fps are multiples of it, and it fits into MPEG-4's 16 bits.
@@ -92,15 +94,8 @@ class VideoSink:
 
     def write_result(self, result: StreamResult) -> None:
         """Draws the lanes or the error on the frame and writes it. Skips a frame that can't be decoded."""
-        from lanestream_client.overlays import draw_error, draw_lanes
-
         with suppress(ImageError):
-            image = result.frame.image()
-            if result.lanes is not None:
-                image = draw_lanes(image, result.lanes)
-            elif result.error is not None:
-                image = draw_error(image, result.error)
-            self.write(image, result.frame.timestamp)
+            self.write(result.draw(), result.frame.timestamp)
 
     def write(self, image: BgrImage, timestamp: float | None) -> None:
         """Adds a BGR image (H, W, 3) uint8 at `timestamp` seconds.

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     import av
     from av.buffer import Buffer
 
-    from lanestream_client.frames import BgrImage, SourceCounts
+    from lanestream_client.frames import SourceCounts
+    from lanestream_client.pixels import BgrImage
 
 # Bytes that FFmpeg can't make packets of cost at most this many attempts to go on behind them.
 _MOST_ATTEMPTS: Final = 64

@@ -142,6 +142,39 @@ def test_stream_through_a_service(run: Run, clip: Path, url: str, mode: str) -> 
     assert "model fake 1 on cpu" in output
 
 
+@pytest.mark.parametrize("remote", [False, True])
+def test_a_preview_is_shown_beside_other_outputs(
+    run: Run, clip: Path, url: str, monkeypatch: pytest.MonkeyPatch, remote: bool
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    where = ["--url", url] if remote else []
+    code, output, errors = run("stream", clip, "--show", "--jsonl", "-", "--video", "a.mp4", *where)
+    assert code == 0
+    assert len(re.findall(r"^preview: http://127\.0\.0\.1:\d+/$", errors, re.MULTILINE)) == 1
+    assert len(output.splitlines()) == 10
+    assert Path("a.mp4").stat().st_size > 0
+
+
+@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="xdg-open is of Linux")
+def test_a_preview_is_opened_where_there_is_a_display(
+    run: Run, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opener = tmp_path / "bin" / "xdg-open"
+    opener.parent.mkdir()
+    opener.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/part && mv {tmp_path}/part {tmp_path}/opened\n')
+    opener.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{opener.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("DISPLAY", ":0")
+    code, _, errors = run("stream", clip, "--show")
+    assert code == 0
+    for _ in range(int(fakes.WAIT_S / 0.05)):
+        if (tmp_path / "opened").exists():
+            break
+        fakes.pause(0.05)
+    assert (tmp_path / "opened").read_text().strip() == re.findall(r"preview: (\S+)", errors)[0]
+
+
 def departing(seq: int) -> LanesMessage:
     """Returns the message for a frame, with a departure event in the sixth."""
     event = DepartureEventModel(state="warning", side="left", track_id=1, timestamp=0.2)

@@ -7,8 +7,10 @@ import threading
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import fakes
+import numpy as np
 import pytest
 from scripted import refused_url
 from websockets.sync.server import ServerConnection
@@ -27,9 +29,11 @@ from lanestream.errors import (
 )
 from lanestream.local import LocalEngine
 from lanestream.protocol import CameraModel, DepartureEventModel, DepartureOptions, LanesMessage
+from lanestream.road.view import Image
 from lanestream_client import AsyncLaneClient, LaneClient, SourceFrame, StreamResult
 from lanestream_client.in_process import InProcessClient
 from lanestream_client.requests import ServiceInfo
+from lanestream_client.sinks import video_sink
 
 Serve = Callable[..., str]
 PAGE = Path(__file__).parents[2] / "docs" / "client.md"
@@ -58,6 +62,88 @@ def test_detect_takes_bytes_and_paths(url: str, tmp_path: Path) -> None:
             client.detect(tmp_path / "missing.jpg")
         with pytest.raises(ProtocolError, match="horizon"):
             client.detect(path, horizon=7.0)
+
+
+def test_detect_takes_pixels_and_draws_on_them(url: str) -> None:
+    picture = fakes.picture()
+    with LaneClient(url) as client:
+        lanes = client.detect(picture)
+        assert (lanes.width, lanes.height) == (320, 180)
+        assert positions(lanes) == [-1, 1]
+        assert positions(client.detect(picture[:, ::-1])) == [-1, 1], "a mirrored view is contiguous nowhere"
+        drawn = lanes.draw(picture)
+        assert drawn.shape == picture.shape
+        assert (drawn != picture).any()
+        with pytest.raises(ImageError, match="the frame is 160 x 90, but its lanes are in pixels of 320 x 180"):
+            lanes.draw(picture[::2, ::2])
+        with pytest.raises(ImageError, match=r"the frame has the type float32 .*rgb\[\.\.\., ::-1\] converts RGB"):
+            client.detect(picture.astype(np.float32))  # type: ignore[arg-type]
+
+
+def test_large_pixels_are_scaled_down_and_their_lanes_back(url: str) -> None:
+    picture = fakes.picture(640, 360)
+    with LaneClient(url) as client:
+        assert client.detect(picture).width == 640
+        (result,) = client.stream([picture], mode="all")
+    assert result.lanes is not None
+    assert (result.lanes.width, result.lanes.height) == (640, 360)
+
+
+def test_streams_take_pixels_and_results_draw_themselves(url: str) -> None:
+    picture = fakes.picture()
+    with LaneClient(url) as client:
+        results = list(client.stream([picture, SourceFrame(1, 0.04, pixels=picture), fakes.image_file()], mode="all"))
+    assert [result.frame.seq for result in results] == [0, 1, 2]
+    assert results[1].lanes is not None
+    assert results[1].lanes.timestamp == 0.04
+    for result in results:
+        drawn = result.draw()
+        assert drawn.shape == picture.shape
+        assert (drawn != picture).any()
+    on_white = results[0].draw(np.full_like(picture, 255))
+    assert on_white[-20:, -20:].min() == 255
+    with pytest.raises(ImageError, match="in pixels of 320 x 180"):
+        results[0].draw(fakes.picture(640, 360))
+
+
+def test_an_error_is_drawn_too(url: str) -> None:
+    with LaneClient(url) as client:
+        failed, unreadable = client.stream([fakes.image_file(shade=255), b"text"], mode="all")
+    assert (failed.draw() != 255).any()
+    with pytest.raises(ImageError, match="can't be decoded"):
+        unreadable.draw()
+
+
+def test_pixels_of_another_type_end_a_stream_after_the_results_before(url: str) -> None:
+    picture = fakes.picture()
+    with LaneClient(url) as client:
+        results = iter(client.stream([picture, picture[..., 0]], mode="all"))
+        assert next(results).frame.seq == 0
+        with pytest.raises(ImageError, match=r"the shape \(180, 320\)"):
+            next(results)
+
+
+async def test_the_async_client_takes_pixels(url: str) -> None:
+    picture = fakes.picture()
+
+    async def camera() -> AsyncIterator[Image]:
+        for _ in range(3):
+            yield picture
+
+    async with AsyncLaneClient(url) as client:
+        assert positions(await client.detect(picture)) == [-1, 1]
+        for source in (camera(), [picture] * 3):
+            results = [result async for result in client.stream(source, mode="all")]
+            assert [result.frame.seq for result in results] == [0, 1, 2]
+            assert all(result.lanes is not None for result in results)
+
+
+def test_pixels_work_in_process() -> None:
+    picture = fakes.picture()
+    client = InProcessClient(LocalEngine(fakes.engine()))
+    assert positions(client.detect(picture)) == [-1, 1]
+    assert positions(client.detect(picture[:, ::-1])) == [-1, 1]
+    assert [positions(result.lanes) for result in client.stream([picture] * 5)][-1] == [-1, 1]
 
 
 @pytest.mark.parametrize("mode", ["all", "latest"])
@@ -330,13 +416,46 @@ def test_the_close_code_of_a_too_large_message_has_its_error() -> None:
         list(client.stream(frames(100), mode="all"))
 
 
+def examples() -> list[str]:
+    """Returns the blocks of Python in docs/client.md."""
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+
+
 def test_the_examples_of_the_client_page_work(
     url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "road.jpg").write_bytes(fakes.image_file())
     monkeypatch.chdir(tmp_path)
-    blocking, asynchronous, _ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    blocking, asynchronous, *_ = examples()
     for code in (blocking, asynchronous):
         exec(code.replace("http://127.0.0.1:8000", url), {})  # noqa: S102
         lines = capsys.readouterr().out.splitlines()
         assert [line.split(" ", 2)[0] for line in lines if line[0].isdigit()] == [str(seq) for seq in range(25)]
+
+
+def test_the_examples_with_arrays_and_other_libraries_work(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "road.jpg").write_bytes(fakes.image_file())
+    monkeypatch.chdir(tmp_path)
+    _, _, arrays, supervision, *_ = (code.replace("http://127.0.0.1:8000", url) for code in examples())
+    names: dict[str, Any] = {}
+    exec(arrays, names)  # noqa: S102
+    assert (tmp_path / "road.lanes.jpg").stat().st_size > 0
+    assert names["picture"].shape == (180, 320, 3)
+    pytest.importorskip("supervision")
+    exec(supervision, names)  # noqa: S102
+    assert (names["picture"] != names["frame"]).any()
+    assert names["zone"].polygon.shape[1] == 2
+
+
+def test_the_example_with_rerun_works(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rerun = pytest.importorskip("rerun")
+    with video_sink(tmp_path / "drive.mp4", 25.0) as sink:
+        assert sink is not None
+        for number in range(5):
+            sink.write(fakes.picture(), number / 25.0)
+    monkeypatch.chdir(tmp_path)
+    (code,) = (code for code in examples() if "rerun.init" in code)
+    monkeypatch.setattr(rerun, "init", lambda name, spawn: None)
+    exec(code.replace("http://127.0.0.1:8000", url), {})  # noqa: S102

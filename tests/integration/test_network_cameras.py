@@ -225,7 +225,7 @@ def test_a_login_works_and_is_never_shown(run: Run, caplog: pytest.LogCaptureFix
 
 
 def test_the_example_of_a_camera_works(url: str, capsys: pytest.CaptureFixture[str]) -> None:
-    (code,) = re.findall(r"```python\n([^`]*open_source.*?)```", PAGE.read_text(), re.DOTALL)
+    (code,) = re.findall(r"```python\n([^`]*rtsp://.*?)```", PAGE.read_text(), re.DOTALL)
     with RtspCamera(12) as camera:
         code = code.replace("http://127.0.0.1:8000", url).replace("10.0.0.7/stream1", f"127.0.0.1:{camera.port}/live")
         with pytest.raises(CameraLostError, match="closed the stream"):

@@ -28,13 +28,19 @@ def plot(report: Mapping[str, Any], path: Path) -> None:
     _plot_throughput(throughput, report)
     _plot_latency(latency, report)
     _plot_age(age, report)
-    machine = report["machine"]
-    figure.suptitle(
-        f"1280 x 720 JPEG to lanes, {machine['processors']} processors ({machine['processor']}), "
-        f"{report['provider']}, {report['candidates_per_frame']:g} candidates per frame",
-        fontsize=10,
-    )
+    figure.suptitle(title(report), fontsize=10)
     figure.savefig(path)
+
+
+def title(report: Mapping[str, Any]) -> str:
+    """Returns the figure's title: what was measured, in which version and on which processor."""
+    machine, version = report["machine"], report["versions"]["lanestream"]
+    rounds = report["rounds"]
+    return (
+        f"Lanestream {version}, 1280 x 720 JPEG to lanes, {report['candidates_per_frame']:g} candidates per frame\n"
+        f"{machine['processors']} processors ({machine['processor']}), {report['provider']}, "
+        f"{rounds} {'round' if rounds == 1 else 'rounds'}"
+    )
 
 
 def _workloads(report: Mapping[str, Any], runner: str, in_flight: int) -> list[Mapping[str, Any]]:
@@ -53,7 +59,7 @@ def _plot_throughput(axes: Axes, report: Mapping[str, Any]) -> None:
     axes.set_xticks(counts, [str(count) for count in counts])
     axes.set_ylim(bottom=0.0)
     axes.set(title="Throughput: higher is better", xlabel="simultaneous cameras", ylabel="frames per second, in total")
-    axes.legend(fontsize=8, loc="center right", bbox_to_anchor=(1.0, 0.52))
+    axes.legend(fontsize=8, loc="best")
     axes.grid(alpha=0.3)
 
 

@@ -17,13 +17,14 @@ from typing import Any, Final
 import click
 import numpy as np
 
+import lanestream
 from bench.in_process import PipelineInfo
 from bench.measure import Overload, Results, Sample
 from bench.workload import BASELINE, IN_PROCESS, LARGE, LITSERVE, SERVICE, Size, Suite, Workload
 from lanestream.host import cpu_affinity, cpu_info
 
 _PACKAGES: Final = (
-    *("lanestream", "onnxruntime", "opencv-python-headless", "numpy", "uvicorn", "websockets", "fastapi"),
+    *("onnxruntime", "opencv-python-headless", "numpy", "uvicorn", "websockets", "fastapi"),
     *("torch", "litserve", "filterpy", "openvino"),
 )
 # The headline numbers by their keys.
@@ -70,7 +71,11 @@ def report(results: Results, suite: Suite, info: PipelineInfo, frames: str) -> d
         "candidates_per_frame": round(info.patches, 2),
         "frames": frames,
         "machine": _machine(),
-        "versions": {"python": platform.python_version(), **dict(_installed_versions())},
+        "versions": {
+            "lanestream": lanestream.__version__,
+            "python": platform.python_version(),
+            **dict(_installed_versions()),
+        },
     }
 
 

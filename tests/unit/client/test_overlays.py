@@ -18,10 +18,14 @@ from lanestream.protocol import (
     MarkingType,
     error_message,
 )
+from lanestream.road.curve import FloatArray
 from lanestream.road.view import Image
-from lanestream_client.drawing import ALERT, CAUTION, WHITE, position_color
-from lanestream_client.line_styles import line_name
+from lanestream_client.colors import ALERT, CAUTION, WHITE, position_color
+from lanestream_client.drawing import Drawing
+from lanestream_client.labels import draw_legend
+from lanestream_client.line_styles import line_name, line_style
 from lanestream_client.overlays import draw_error, draw_lanes
+from lanestream_client.road_panel import draw_road_panel, panel_width
 
 
 def road(width: int, height: int) -> tuple[Image, LanesMessage]:
@@ -147,6 +151,13 @@ def test_a_predicted_boundary_is_paler_whatever_it_is(fields: dict[str, object])
     assert brightest[0] + 30 < brightest[1] + 15 < brightest[2]
 
 
+def test_the_legend_has_the_latency_if_it_is_known() -> None:
+    image, message = road(1280, 720)
+    timed = message.model_copy(update={"timing_ms": message.timing_ms.model_copy(update={"total": 12.3})})
+    titles = [draw_lanes(image, each)[13:45, 13:300] for each in (message, timed)]
+    assert with_color(titles[0], WHITE) < 0.7 * with_color(titles[1], WHITE)
+
+
 def test_the_legend_says_what_boundaries_are() -> None:
     _, message = road(320, 180)
     marking, edge = message.lanes
@@ -231,6 +242,126 @@ def test_the_map_shows_the_road_and_its_uncertainty() -> None:
     assert (without == 90).all()
 
 
+SIZES = [(320, 180), (640, 360), (640, 640), (1280, 720), (3840, 2160)]
+
+
+def green(drawn: Image) -> FloatArray:
+    """Returns how much greener than red each pixel is, which on a gray road is the opacity of the ego lane."""
+    return drawn[..., 1].astype(float) - drawn[..., 2]
+
+
+def test_the_ego_lane_fades_with_distance_and_toward_the_vehicle() -> None:
+    image, message = road(1280, 720)
+    opacity = green(draw_lanes(image, message))[:, 640]
+    assert opacity[560] > opacity[450] > opacity[380] > 0.0
+    assert opacity[370] < 0.25 * opacity[560], "the far end is nearly invisible"
+    assert opacity[560] > opacity[690] > opacity[717] >= 0.0
+    assert opacity[717] < 0.2 * opacity[560]
+    assert np.abs(np.diff(opacity[362:718])).max() < 5.0, "no edge runs across the lane"
+    assert (opacity[:358] == 0.0).all()
+
+
+def test_the_ego_lane_starts_at_the_lowest_points() -> None:
+    image, message = road(1280, 720)
+    lanes = []
+    for lane, bottom in zip(message.lanes, (600.0, 560.0), strict=True):
+        line = LineModel(bottom=(lane.x(bottom), bottom), top=lane.line.top)
+        lanes.append(lane.model_copy(update={"line": line}))
+    opacity = green(draw_lanes(image, message.model_copy(update={"lanes": lanes})))
+    assert opacity[500, 640] > 10.0
+    assert (opacity[602:, 640] == 0.0).all(), "nothing below, where the vehicle's hood may be"
+
+
+def test_the_ego_lane_goes_on_beside_a_boundary_that_leaves_the_image() -> None:
+    image, message = road(1280, 720)
+    left = message.lanes[0]
+    # It reaches the left side of the image at row 538 of 720.
+    curve = (640.0, -2.56, 0.0)
+    ends = [(curve[0] + curve[1] * (row - left.horizon), row) for row in (535.0, 360.0)]
+    oblique = left.model_copy(
+        update={"coefficients": curve, "points": ends, "line": LineModel(bottom=ends[0], top=ends[1])}
+    )
+    opacity = green(draw_lanes(image, message.model_copy(update={"lanes": [oblique, message.lanes[1]]})))
+    assert opacity[560, 5] > 10.0
+    assert np.abs(np.diff(opacity[500:718, 300])).max() < 5.0
+
+
+@pytest.mark.parametrize("state", ["detected", "inferred", "predicted"])
+def test_lines_fade_with_distance(state: str) -> None:
+    image, message = road(1280, 720)
+    drawn = alone(image, message, state=state, **painted("white", "double"))
+    strength = np.ptp(drawn.astype(int), axis=2).max(axis=1)  # how colorful the rows from 360 to 720 are
+    assert strength[2:20].max() < 0.75 * strength[200:].max()
+
+
+def test_boundaries_that_are_barely_probable_are_faint() -> None:
+    image, message = road(1280, 720)
+    strength = [
+        int(np.ptp(alone(image, message, probability=probability, position=2)[:150].astype(int), axis=2).max())
+        for probability in (0.3, 0.6, 0.95)
+    ]
+    assert 10 < strength[0] < 0.6 * strength[2]
+    assert strength[0] < strength[1] < strength[2]
+
+
+def test_predicted_lines_fade_more_than_detected_ones() -> None:
+    _, message = road(320, 180)
+    detected, predicted = (
+        line_style(message.lanes[0].model_copy(update={"state": s})) for s in ("detected", "predicted")
+    )
+    assert predicted.far_opacity / predicted.near_opacity < detected.far_opacity / detected.near_opacity
+    assert len(predicted.pieces) > len(detected.pieces) == 1
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_text_is_inside_the_image_and_nothing_overlaps(width: int, height: int) -> None:
+    image, message = road(width, height)
+    message = in_meters(message, 0.3, DepartureModel(), 0.01)
+    outer = [
+        lane.model_copy(update={"track_id": 3 + number, "position": 2 * lane.position, **painted("yellow", "dashed")})
+        for number, lane in enumerate(message.lanes)
+    ]
+    message = message.model_copy(update={"lanes": [*message.lanes, *outer]})
+    drawing = Drawing.on_copy_of(image)
+    legend = draw_legend(drawing, message, width - panel_width(drawing, message))
+    assert legend is not None
+    boxes = [legend, *draw_road_panel(drawing, message)]
+    assert len(boxes) == (2 if width == 320 else 3), "the map has no room on small images"
+    for left, top, right, bottom in boxes:
+        assert 0.0 <= left < right <= width
+        assert 0.0 <= top < bottom <= 0.5 * height
+    for number, (_, _, right, _) in enumerate(sorted(boxes)[:-1]):
+        assert right < sorted(boxes)[number + 1][0]
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_letters_are_at_least_seven_pixels_high(width: int, height: int) -> None:
+    drawing = Drawing.on_copy_of(np.zeros((height, width, 3), np.uint8))
+    drawing.text("H", (20.0, 100.0), WHITE, 0.5)
+    rows = np.nonzero((drawing.image > 100).any(axis=(1, 2)))[0]
+    assert 7 <= np.ptp(rows) + 1 <= 0.06 * height
+
+
+def test_text_is_clipped_at_the_edges_of_the_image() -> None:
+    inside = [(-30.0, 20.0), (300.0, 20.0), (20.0, 3.0), (20.0, 184.0)]
+    outside = [(20.0, -20.0), (20.0, 220.0), (900.0, 20.0), (-900.0, 900.0)]
+    for at in (*inside, *outside):
+        drawing = Drawing.on_copy_of(np.zeros((180, 320, 3), np.uint8))
+        drawing.text("frame 17", at, WHITE)
+        assert drawing.image.any() == (at in inside)
+
+
+def test_labels_do_not_hide_each_other() -> None:
+    image, message = road(640, 360)
+    lane = message.lanes[0]
+    several = [lane.model_copy(update={"track_id": number, "position": -number}) for number in (1, 2, 3)]
+    alone_drawn = draw_lanes(image, message.model_copy(update={"lanes": several[:1]}))
+    drawn = draw_lanes(image, message.model_copy(update={"lanes": several}))
+    row = round(0.7 * lane.line.bottom[1] + 0.3 * lane.line.top[1])
+    label = (slice(row - 6, row + 6), slice(round(lane.x(row)) - 6, round(lane.x(row)) + 6))
+    assert (drawn[label] == alone_drawn[label]).all(), "the label of the ego boundary is in its place, on top"
+
+
 def test_no_lanes_and_unknown_positions_can_be_drawn() -> None:
     image, message = road(320, 180)
     assert draw_lanes(image, message.model_copy(update={"lanes": []})).shape == image.shape
@@ -241,3 +372,11 @@ def test_no_lanes_and_unknown_positions_can_be_drawn() -> None:
 def test_an_error_can_be_drawn() -> None:
     image = np.full((180, 320, 3), 90, np.uint8)
     assert (draw_error(image, error_message(SourceError("why"), seq=3)) != image).any()
+
+
+def test_a_long_error_is_written_on_several_lines() -> None:
+    image = np.full((180, 320, 3), 90, np.uint8)
+    short, long = (draw_error(image, error_message(SourceError(text), seq=3)) for text in ("why", "why " * 30))
+    changed = [np.nonzero((drawn != image).any(axis=(1, 2)))[0].max() for drawn in (short, long)]
+    assert changed[1] > changed[0] + 20
+    assert (long[:, 312:] == 90).all(), "no line reaches the edge"

@@ -13,7 +13,7 @@ from bench.frames import forward_and_backward, load_clips
 from bench.in_process import PipelineInfo
 from bench.load_generator import Load
 from bench.measure import Overload, Results, Sample, split_load
-from bench.plot import plot
+from bench.plot import plot, title
 from bench.report import HEADLINES, ages_by_second, main, markdown, report
 from bench.runners import HelperProcess, server_programs
 from bench.workload import (
@@ -30,6 +30,8 @@ from bench.workload import (
     Suite,
 )
 from click.testing import CliRunner
+
+from lanestream import __version__
 
 INFO = PipelineInfo(processes=2, threads=1, model="fake 1", provider="cpu", patches=12.25)
 SUITE = Suite(rounds=3, sizes=(LARGE,), sessions=(1, 4, 64), overload_clients=(4,))
@@ -159,6 +161,8 @@ def test_the_tables_and_the_figure_are_made_from_the_json(tmp_path: Path) -> Non
     assert sum(line.startswith("| service") for line in lines) == 5  # three throughputs and two latencies
     plot(content, tmp_path / "bench.png")
     assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert f"Lanestream {__version__}," in title(content)
+    assert f"({content['machine']['processor']})" in title(content)
 
 
 def test_a_file_that_is_not_a_report_is_an_error_in_one_line(tmp_path: Path) -> None:
