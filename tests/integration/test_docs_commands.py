@@ -47,6 +47,8 @@ NOT_RUN = [
     ("docs/client.md", "from lanestream_client import *open_source*", "tests/integration/test_network_cameras.py"),
     ("docs/client.md", "from pathlib import Path*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import asyncio*", "tests/integration/test_clients.py"),
+    ("docs/client.md", "import cv2*", "tests/integration/test_clients.py"),
+    ("docs/client.md", "import rerun*", "tests/integration/test_clients.py"),
     ("docs/deployment.md", "make up", DOCKER),
     ("docs/deployment.md", "make image*", DOCKER),
     ("docs/deployment.md", "docker *", DOCKER),

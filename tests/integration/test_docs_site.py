@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from docs_site import ELSEWHERE, site_target
 
+import lanestream_client
+
 ROOT = Path(__file__).parents[2]
 # What a browser would load by itself.
 LOADED = re.compile(
@@ -42,8 +44,9 @@ def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
 
 
 def test_the_reference_has_the_public_interfaces(site: Path) -> None:
-    python = text(site / "reference" / "python" / "index.html")
-    assert "Tracks lanes in the frames of one camera" in python or "LaneClient" in python
+    page = (ROOT / "docs" / "reference" / "python.md").read_text()
+    assert sorted(re.findall(r"^::: \S+\.(\w+)$", page, re.MULTILINE)) == sorted(lanestream_client.__all__)
+    assert "reconnect_s: float" in text(site / "reference" / "python" / "index.html")
     rest = text(site / "reference" / "rest" / "index.html")
     assert "POST /v1/detect" in rest
     assert "GET /readyz" in rest
