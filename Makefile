@@ -22,7 +22,7 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 
-.PHONY: docs docs-serve attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check fuzz picture moving-picture image image-test up down clean
+.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -92,6 +92,10 @@ attack: $(DEV_READY)
 asyncapi: $(DEV_READY)
 	$(BIN)/python tools/asyncapi.py docs/asyncapi.yaml
 
+# Updates what the Helm chart repeats: the version, the alerts, and the names and types of settings.
+chart: $(DEV_READY)
+	$(BIN)/python tools/chart.py
+
 # Needs npm: the schema of AsyncAPI documents is published only there.
 asyncapi-check: $(DEV_READY)
 	npm install --silent --no-audit --no-fund --prefix out/asyncapi @asyncapi/specs@6
@@ -121,6 +125,7 @@ lock: | $(VENV)/bin/python
 	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
+.PHONY: docs docs-serve
 docs docs-serve: export NO_MKDOCS_2_WARNING = 1
 docs: $(DEV_READY)
 	$(BIN)/mkdocs build

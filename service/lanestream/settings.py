@@ -38,8 +38,10 @@ if TYPE_CHECKING:
 _PREFIX: Final = "LANESTREAM_"
 # Variables of other programs: the client's key, the data for training, what compose.yaml publishes.
 _OTHER_VARIABLES: Final = frozenset({"LANESTREAM_API_KEY", "LANESTREAM_DATA", "LANESTREAM_PUBLISH"})
-# What Kubernetes sets for a Service named "lanestream".
-_KUBERNETES_VARIABLE: Final = re.compile(r"LANESTREAM_(SERVICE_(HOST|PORT.*)|PORT_\d+_.*)")
+# What Kubernetes sets for Services named "lanestream" or "lanestream-...", with its value.
+_KUBERNETES_VARIABLE: Final = re.compile(
+    r"LANESTREAM_(\w+_)?(SERVICE_(HOST|PORT\w*)|PORT_\d+_\w+)=.*|LANESTREAM_\w+_PORT=(tcp|udp|sctp)://.*", re.DOTALL
+)
 _ORIGIN: Final = re.compile(r"[a-z][a-z0-9+.-]*://[^/\s*?#@]+")
 _MASK: Final = "***"
 _MOST_BUFFERED_BYTES: Final = 256 << 20
@@ -377,12 +379,12 @@ def load_settings(**options: object) -> Settings:
 
 def _check_variables() -> None:
     """Raises SettingsError if an environment variable has the prefix of the settings and is not one of them."""
-    for variable in os.environ:
+    for variable, value in os.environ.items():
         full_name = variable.upper()
         name = full_name.removeprefix(_PREFIX).lower()
         if name in Settings.model_fields or full_name in _OTHER_VARIABLES or not full_name.startswith(_PREFIX):
             continue
-        if not _KUBERNETES_VARIABLE.fullmatch(variable):
+        if not _KUBERNETES_VARIABLE.fullmatch(f"{variable}={value}"):
             nearest = _nearest_setting(name)
             raise _unknown_setting(
                 f"the environment variable {one_line(variable, 80)}", nearest and _PREFIX + nearest.upper()

@@ -34,6 +34,7 @@ from lanestream_exporter.scenes import sample_clip, write_clip
 
 DOCKER = "needs Docker; `make image-test` checks the image"
 LONG = "takes too long"
+SYSTEM = "changes the system; the tests of the unit are in tests/unit/deploy"
 ANY = "any page"
 # What does not run here: the page, a pattern of the command or program, and why.
 NOT_RUN = [
@@ -53,8 +54,14 @@ NOT_RUN = [
     ("docs/deployment.md", "make image*", DOCKER),
     ("docs/deployment.md", "docker *", DOCKER),
     ("docs/deployment.md", "LANESTREAM_PUBLISH=* docker compose *", DOCKER),
+    ("docs/deployment.md", "*/opt/lanestream*", SYSTEM),
+    ("docs/deployment.md", "*/etc/lanestream*", SYSTEM),
+    ("docs/deployment.md", "cp * /etc/systemd/*", SYSTEM),
+    ("docs/deployment.md", "systemctl *", SYSTEM),
+    ("docs/deployment.md", "journalctl *", SYSTEM),
     ("docs/exporting.md", "lanestream export alexnet.pt *", "tests/unit/exporter/exporting/test_export_parts.py"),
     ("docs/index.md", "lanestream stream my_drive.mp4 *", "is the first command of the quick start"),
+    ("docs/kubernetes.md", "*", "needs a cluster and a registry; the tests of the chart are in tests/unit/deploy"),
     ("docs/operations.md", "curl -X POST *", "needs a service with keys; tests/integration/test_access.py"),
     ("docs/operations.md", "new WebSocket(*", "one line of a web page; tests/integration/test_access.py"),
     ("docs/protocol.md", "new WebSocket(*", "one line of a web page; tests/integration/test_access.py"),
@@ -78,6 +85,8 @@ PRINTED = {
 }
 # Blocks in these languages are data or belong to other programs.
 NOT_CODE = {"json", "nginx", "text", "toml", "yaml"}
+# Commands that are safe to run. Others must be listed above.
+SAFE = {"curl", "head", "lanestream", "make"}
 # With Node 20 `WebSocket` is an option.
 PROGRAMS = {
     "python": (sys.executable, "-c"),
@@ -100,6 +109,11 @@ def pieces(page: str) -> Iterator[tuple[Block, str]]:
             yield from ((block, command) for command in commands(block))
         elif block.language not in SHELL | NOT_CODE:
             yield block, block.text
+
+
+def is_safe(block: Block, code: str) -> bool:
+    """Whether a block's program or command may run here, whatever someone writes into the documentation."""
+    return block.language in PROGRAMS or re.sub(r"^([A-Z_]+=\S+ )*", "", code).split()[0] in SAFE
 
 
 RUNNING = [page for page in PAGES if any(reason_not_to_run(page, code) is None for _, code in pieces(page))]
@@ -148,6 +162,7 @@ class Reader:
     def follow(self, block: Block, code: str) -> None:
         """Runs a command or a program as the page shows it."""
         where = f"{block.page}:{block.line}"
+        assert is_safe(block, code), where
         code = re.sub(r"127\.0\.0\.1:8000|10\.0\.0\.[56]:8000", f"127.0.0.1:{self.port}", code)
         if re.match(r"([A-Z_]+=\S+ )*lanestream serve(?!.*--print-config)", code):
             self.port = self.stack.enter_context(serving(code, self.folder))

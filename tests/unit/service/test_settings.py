@@ -110,6 +110,20 @@ def test_variables_of_other_programs_are_ignored(name: str, monkeypatch: pytest.
     load_settings()
 
 
+def test_variables_for_other_services_of_kubernetes_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (
+        ("LANESTREAM_REDIS_SERVICE_HOST", "10.3.1.2"),
+        ("LANESTREAM_REDIS_SERVICE_PORT_REDIS", "6379"),
+        ("LANESTREAM_REDIS_PORT", "tcp://10.3.1.2:6379"),
+        ("LANESTREAM_REDIS_PORT_6379_TCP_ADDR", "10.3.1.2"),
+    ):
+        monkeypatch.setenv(name, value)
+    load_settings()
+    monkeypatch.setenv("LANESTREAM_REDIS_PORT", "6379")
+    with pytest.raises(SettingsError, match="LANESTREAM_REDIS_PORT is not a setting"):
+        load_settings()
+
+
 def test_the_port_that_kubernetes_sets_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LANESTREAM_PORT", "tcp://10.3.241.7:8000")
     with pytest.raises(SettingsError, match="Kubernetes") as caught:
