@@ -149,6 +149,14 @@ lock: | $(VENV)/bin/python
 	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
+.PHONY: docs docs-serve
+docs docs-serve: export NO_MKDOCS_2_WARNING = 1
+docs: $(DEV_READY)
+	$(BIN)/mkdocs build
+
+docs-serve: $(DEV_READY)
+	$(BIN)/mkdocs serve
+
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
 
@@ -188,7 +196,7 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,docs,dev]'
 	@touch $@ $(RUN_READY)
 
 $(JS_READY): client/js/package-lock.json
