@@ -25,7 +25,7 @@ DEV_READY := $(VENV)/.ready-dev
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint js js-types lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean
+.PHONY: attack batch-ray batch-speed bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean js js-types
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -121,6 +121,15 @@ ablation: $(DEV_READY)
 bench: $(DEV_READY)
 	PYTHONPATH=tools $(BIN)/python -m bench $(ARGS)
 
+# Measures how much of what the processors could do `lanestream batch` does. ARGS='VIDEO...' instead of rendered ones.
+batch-speed: $(DEV_READY)
+	$(BIN)/python tools/batch_speed.py $(ARGS)
+
+# Tests `lanestream batch --ray` on a cluster of three nodes on this machine. Ray is large, so only this installs it.
+batch-ray: $(DEV_READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ray]'
+	$(BIN)/python -m pytest tests/integration/test_batch_ray.py
+
 # Attacks services that it starts on 127.0.0.1, and prints what normal cameras felt. Needs redis-server and faketime.
 attack: $(DEV_READY)
 	PYTHONPATH=tools $(BIN)/python -m attack $(ARGS)
@@ -161,6 +170,14 @@ lock: | $(VENV)/bin/python
 	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
+.PHONY: docs docs-serve
+docs docs-serve: export NO_MKDOCS_2_WARNING = 1
+docs: $(DEV_READY)
+	$(BIN)/mkdocs build
+
+docs-serve: $(DEV_READY)
+	$(BIN)/mkdocs serve
+
 picture: $(RUN_READY)
 	$(BIN)/python tools/picture.py docs/lanes.jpg
 
@@ -200,7 +217,7 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,docs,dev]'
 	@touch $@ $(RUN_READY)
 
 $(JS_READY): client/js/package-lock.json

@@ -143,7 +143,8 @@ STAGES: Final[dict[str, Leave | None]] = {
 
 
 def make_material(folder: Path, data: Path | None) -> list[Path]:
-    """Returns the files of sequences in `folder`, and makes missing ones."""
+    """Returns the files of sequences in `folder`, and makes missing ones. Raises LabelError without real frames."""
+    DatasetCollection.open(None, data).require_splits("train", "val")  # first, because rendering takes long
     folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(processors(), mp_context=get_context("spawn")) as pool:
         jobs = [pool.submit(_real_file, folder, data)]

@@ -44,6 +44,8 @@ masks = [[0.84, 0.015, 0.99, 0.1]]
 def main(data: Path, runs: Path, models: Path, out: Path) -> None:
     """Fine-tunes and evaluates networks for every number of frames, and prints the table."""
     source = data.resolve() / FOLDER
+    if not source.is_dir():
+        raise click.ClickException(f"there is nothing at {source} (see `lanestream data fetch {FOLDER}`)")
     before = models / "classifier-first.onnx", models / "regressor-first.onnx"
     rows = [(0, 0.0, evaluated(data, *before, out / "0.json"))]
     for size in SIZES:

@@ -64,11 +64,11 @@ def main(folder: Path) -> None:
     print(f"the service found {len(answer['lanes'])} boundaries; {time.monotonic() - started:.0f} s in all")
 
 
-def draw_drive(folder: Path, seed: int) -> None:
+def draw_drive(folder: Path, seed: int, frames: int = FRAMES) -> None:
     """Renders images into `folder`, each with a LabelMe file."""
     folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
-    for number in range(FRAMES):
+    for number in range(frames):
         still = render_still(sample_scene(rng, 640, 360))
         name = f"{number:04d}.jpg"
         cv2.imwrite(str(folder / name), still.image)

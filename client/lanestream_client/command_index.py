@@ -9,6 +9,11 @@ from collections.abc import Mapping
 from typing import Final
 
 COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
+    "batch": {
+        "target": "lanestream_client.batch.command:batch",
+        "extra": "video",
+        "help": "Find lanes in archives of videos and images.",
+    },
     "detect": {
         "target": "lanestream_client.commands:detect",
         "extra": "video",

@@ -19,23 +19,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lanestream.errors import ImageError, LanestreamError, SourceError, needs_extra
-from lanestream.protocol import (
-    HIGHEST_HORIZON,
-    BoundaryKind,
-    CameraModel,
-    DetectorName,
-    Mode,
-    parse_camera,
-    read_camera_file,
-)
+from lanestream.protocol import BoundaryKind, DetectorName, Mode
 from lanestream.writing import check_folder, writing
 from lanestream_client.annotated_names import annotated_names
 from lanestream_client.client import LaneClient
 from lanestream_client.departure_clips import departure_clips
 from lanestream_client.failover import RetryPolicy
 from lanestream_client.frames import CameraSource, SourceCounts, SourceFrame, StreamResult
-from lanestream_client.image_files import image_files, lacks_jpeg_end, read_image_file
-from lanestream_client.in_process import InProcessClient, InProcessEngine
+from lanestream_client.image_files import NO_JPEG_END, image_files, lacks_jpeg_end, read_image_file
+from lanestream_client.in_process import InProcessClient
+from lanestream_client.options import Command, LoadEngine, chosen_camera, detection_options, network_options
 from lanestream_client.preview import Preview, has_display, preview
 from lanestream_client.requests import ServiceInfo
 from lanestream_client.sinks import RunReport, json_lines_sink, video_sink
@@ -47,94 +40,35 @@ if TYPE_CHECKING:
     from lanestream_client.in_process import LaneService, ResultStream
     from lanestream_client.sinks import ResultSink
 
-# Loads an engine from the model file, the name of the execution provider and the regressor file. Each may be None for
-# the default. Raises click.BadParameter if the provider is unknown.
-LoadEngine = Callable[[Path | None, str | None, Path | None], InProcessEngine]
-_Command = Callable[..., None]
-_NO_END: Final = "the JPEG has no end marker; if it was cut short, its last pixels are missing"
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 
 
-def _common_options(command: _Command) -> _Command:
-    options = [
-        click.option(
-            "--url",
-            multiple=True,
-            help="URL of a service, such as http://127.0.0.1:8000; repeat it for replicas  [default: run in process]",
-        ),
-        click.option(
-            "--api-key",
-            envvar="LANESTREAM_API_KEY",
-            show_envvar=True,
-            metavar="KEY",
-            help="API key for the service.",
-        ),
-        click.option(
-            "--model",
-            type=click.Path(path_type=Path),
-            metavar="FILE|shipped",
-            help="ONNX file of the network to run in process  [default: shipped]",
-        ),
-        click.option(
-            "--regressor",
-            type=click.Path(path_type=Path),
-            metavar="FILE|shipped|none",
-            help="ONNX file of the regressor to run in process  [default: shipped]",
-        ),
-        click.option(
-            "--provider",
-            metavar="NAME",
-            help="Execution provider in process; see `lanestream doctor --help`  [default: auto]",
-        ),
-        click.option(
-            "--detector",
-            type=click.Choice(get_args(DetectorName)),
-            help="Detector to use  [default: the model's]",
-        ),
-        click.option(
-            "--horizon",
-            type=click.FloatRange(HIGHEST_HORIZON, 1.0, max_open=True),
-            help="Row of the horizon as a share of the image height, negative above the image  [default: estimated]",
-        ),
-        click.option(
-            "--camera",
-            "camera_file",
-            type=click.Path(path_type=Path),
-            metavar="FILE",
-            help="Camera file, such as `lanestream calibrate` writes; lanes are also given in meters.",
-        ),
-        click.option(
-            "--camera-height",
-            type=click.FloatRange(0.3, 4.0),
-            metavar="M",
-            help="Height of the camera in meters; with --field-of-view, lanes are also given in meters.",
-        ),
-        click.option(
-            "--field-of-view",
-            type=click.FloatRange(20.0, 150.0),
-            metavar="DEG",
-            help="Horizontal field of view of the camera in degrees.",
-        ),
-        click.option(
-            "--kinds",
-            type=click.Choice(get_args(BoundaryKind)),
-            multiple=True,
-            help="Kind of boundaries to report; repeat it for several  [default: the service's, or all]",
-        ),
-        click.option(
-            "--jsonl",
-            type=click.Path(path_type=Path),
-            help="Write one line of JSON per frame to this file; - is standard output.",
-        ),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+def _service_options(command: Command) -> Command:
+    """Adds the options of a service, which is used instead of the networks of this process."""
+    key = click.option(
+        "--api-key", envvar="LANESTREAM_API_KEY", show_envvar=True, metavar="KEY", help="API key for the service."
+    )
+    url = click.option(
+        "--url",
+        multiple=True,
+        help="URL of a service, such as http://127.0.0.1:8000; repeat it for replicas  [default: run in process]",
+    )
+    return url(key(command))
+
+
+_jsonl_option = click.option(
+    "--jsonl",
+    type=click.Path(path_type=Path),
+    help="Write one line of JSON per frame to this file; - is standard output.",
+)
 
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="PATH...")
-@_common_options
+@_service_options
+@network_options
+@detection_options
+@_jsonl_option
 @click.option(
     "--annotate", type=click.Path(path_type=Path, file_okay=False), help="Write images with lanes to this folder."
 )
@@ -156,7 +90,7 @@ def detect(
     """Find lanes in images: files, or folders of them. Each image is processed on its own."""
     files = _image_files(paths)
     names = annotated_names(files)
-    camera = _camera(camera_file, camera_height, field_of_view)
+    camera = chosen_camera(camera_file, camera_height, field_of_view)
     if annotate is not None:
         check_folder(annotate)
     report = RunReport()
@@ -188,7 +122,10 @@ def detect(
 
 @click.command()
 @click.argument("source")
-@_common_options
+@_service_options
+@network_options
+@detection_options
+@_jsonl_option
 @click.option(
     "--mode",
     type=click.Choice(get_args(Mode)),
@@ -269,7 +206,7 @@ def stream(
 
     SOURCE is a video file, a folder of images, a camera number or an rtsp:// or http:// URL.
     """
-    camera = _camera(camera_file, camera_height, field_of_view)
+    camera = chosen_camera(camera_file, camera_height, field_of_view)
     if session is not None and not where["url"]:
         raise click.UsageError("--session needs a service: add --url")
     if record_departures is not None and camera is None:
@@ -367,7 +304,7 @@ class _StreamRun:
         self.report.write_result(result)
         if not self._warned_of_end and lacks_jpeg_end(result.frame.data or b""):
             self._warned_of_end = True
-            click.echo(f"warning: frame {result.frame.seq}: {_NO_END}", err=True)
+            click.echo(f"warning: frame {result.frame.seq}: {NO_JPEG_END}", err=True)
         if result.error is not None:
             click.echo(f"frame {result.frame.seq}: {result.error.message}", err=True)
         for sink in self._sinks:
@@ -431,15 +368,6 @@ def _progress_bar(label: str, length: int | None) -> Iterator[Callable[[], None]
         yield lambda: bar.advance(task)
 
 
-def _camera(file: Path | None, height: float | None, field_of_view: float | None) -> CameraModel | None:
-    """Returns the camera that the options describe. Raises UsageError and ProtocolError."""
-    if file is None:
-        return parse_camera(height, field_of_view)
-    if height is not None or field_of_view is not None:
-        raise click.UsageError("--camera can't be used with --camera-height and --field-of-view: the file has both")
-    return read_camera_file(file)
-
-
 def _image_files(paths: Sequence[Path]) -> list[Path]:
     return [
         file
@@ -461,7 +389,7 @@ def _detect_file(detect_one: Callable[[bytes], LanesMessage], path: Path) -> Str
         click.echo(f"error: {path}: {error}", err=True)
         return None
     if lacks_jpeg_end(data):
-        click.echo(f"warning: {path}: {_NO_END}", err=True)
+        click.echo(f"warning: {path}: {NO_JPEG_END}", err=True)
     return StreamResult(SourceFrame(0, None, data=data, name=str(path)), lanes=lanes)
 
 

@@ -14,6 +14,7 @@ from lanestream.errors import SourceError, needs_extra
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", ".heic", ".heif")
 _CONVERTED: Final = re.compile(rb"BM|II\*\0|MM\0\*|....ftypavi[fs]", re.DOTALL)
 _JPEG_QUALITY: Final = 95
+NO_JPEG_END: Final = "the JPEG has no end marker; if it was cut short, its last pixels are missing"
 
 
 def image_files(folder: Path, notify: Callable[[str], object] | None = None) -> list[Path]:
@@ -32,7 +33,7 @@ def image_files(folder: Path, notify: Callable[[str], object] | None = None) -> 
         )
     if passed_over and notify is not None:
         notify(f"{folder}: skipped everything but image files ({passed_over})")
-    return sorted(files, key=_natural_key)
+    return sorted(files, key=lambda path: natural_key(path.name))
 
 
 def read_image_file(path: Path) -> bytes:
@@ -69,5 +70,6 @@ def _kind(path: Path) -> str:
     return "folders" if path.is_dir() else path.suffix.lower() or "files without a suffix"
 
 
-def _natural_key(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name.lower())]
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Returns the key by which names are in natural order, 2.jpg before 10.jpg."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name.lower())]

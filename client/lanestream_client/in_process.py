@@ -109,6 +109,11 @@ class InProcessNetwork(Protocol):
         ...
 
     @property
+    def sha256(self) -> str:
+        """The hash of its file in hexadecimal."""
+        ...
+
+    @property
     def placement(self) -> InProcessPlacement:
         """Where it runs."""
         ...

@@ -54,14 +54,19 @@ class JsonLinesSink:
 
     def write_result(self, result: StreamResult) -> None:
         """Writes the frame's lanes or its error."""
+        self._file.write(self.line(result))
+
+    @staticmethod
+    def line(result: StreamResult) -> str:
+        """Returns the line of a frame with its end; empty if it has neither lanes nor an error."""
         message = result.lanes or result.error
-        if message is not None:
-            frame = result.frame
-            fields = {"file": frame.name, **message.model_dump(mode="json")}
-            fields |= {"clock": frame.clock, "reconnects": frame.reconnects}
-            unknown = {name for name in ("file", "clock", "reconnects") if not fields[name]}
-            known = {name: value for name, value in fields.items() if name not in unknown}
-            self._file.write(json.dumps(known) + "\n")
+        if message is None:
+            return ""
+        frame = result.frame
+        fields = {"file": frame.name, **message.model_dump(mode="json")}
+        fields |= {"clock": frame.clock, "reconnects": frame.reconnects}
+        unknown = {name for name in ("file", "clock", "reconnects") if not fields[name]}
+        return json.dumps({name: value for name, value in fields.items() if name not in unknown}) + "\n"
 
 
 @contextmanager

@@ -43,8 +43,11 @@ _NO_TIMESTAMPS: Final = 0x80  # FFmpeg's AVFMT_NOTIMESTAMPS
 
 
 @contextmanager
-def open_video_file(path: str) -> Iterator[CameraSource]:
-    """Opens a video file. Raises SourceError if it can't be read."""
+def open_video_file(path: str, threads: int | None = None) -> Iterator[CameraSource]:
+    """Opens a video file, to be decoded in this number of threads, or in FFmpeg's number if it is None.
+
+    Raises SourceError if it can't be read.
+    """
     try:
         container = open_video(f"file:{path}")  # so that no name is taken for a URL, such as 12:30.mp4
     except VideoError as error:
@@ -52,6 +55,8 @@ def open_video_file(path: str) -> Iterator[CameraSource]:
         reason, hint = (str(error), SOURCE_HINT) if known is None else known
         raise SourceError(f"can't open {path}: {reason}", hint) from None
     with container:
+        if threads is not None:
+            container.streams.video[0].codec_context.thread_count = threads
         yield _recording(container, path)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from lanestream.protocol import CameraModel
 from lanestream.road.view import Image
 from lanestream.session import SessionOptions
 from lanestream.tracking.calibration import FRAMES_NEEDED
+from lanestream_exporter.datasets.files import natural_key
 from lanestream_exporter.datasets.images import LIMITS, file_bytes
 
 import cv2  # isort: skip  (lanestream.images sets OpenCV's own limit before it is imported)
@@ -175,7 +175,9 @@ def calibrate_mount(pictures: Iterable[Picture], camera: CameraModel, engine: En
 
 
 def _folder(folder: Path) -> Iterator[Picture]:
-    files = sorted((path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES), key=_natural_key)
+    files = sorted(
+        (path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES), key=lambda path: natural_key(path.name)
+    )
     if not files:
         raise SourceError(f"no images in the folder {folder}", f"accepted file types: {', '.join(_SUFFIXES)}")
     for number, path in enumerate(files):
@@ -184,10 +186,6 @@ def _folder(folder: Path) -> Iterator[Picture]:
             yield replace(picture, image=decode(file_bytes(path), LIMITS))
         except ImageError as error:
             yield replace(picture, problem=error.message)
-
-
-def _natural_key(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name.lower())]
 
 
 def _video(video: Path) -> Iterator[Picture]:

@@ -15,7 +15,11 @@ CLIP_KINDS: Final = (
     *("clutter", "drift", "long"),
 )
 # The keys of `datasets.formats.FORMATS`, after its AUTO.
-LABEL_FORMATS: Final = ("auto", "tusimple", "culane", "caltech", "labelme", "cvat", "masks", "clips")
+LABEL_FORMATS: Final = ("auto", "tusimple", "culane", "caltech", "labelme", "cvat", "label-studio", "masks", "clips")
+# The keys of `labeling.writers.WRITERS`.
+PRELABEL_FORMATS: Final = ("cvat", "labelme", "label-studio", "tusimple", "culane")
+# `datasets.label_map.MEANINGS`.
+LABEL_MEANINGS: Final = ("lane", "road_edge", "ignore")
 # The values of `exporting.exportable.Precision`.
 PRECISIONS: Final = ("fp32", "fp16", "int8")
 # The keys of `exporting.graph.NORMALIZATIONS`.

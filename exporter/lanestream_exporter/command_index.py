@@ -21,8 +21,13 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "data": {
         "target": "lanestream_exporter.data_commands:data",
-        "extra": "export",
-        "help": "Inspect and prepare labeled frames.",
+        "extra": "data",
+        "help": "Check labeled frames, and find public ones.",
+    },
+    "label": {
+        "target": "lanestream_exporter.label_commands:label",
+        "extra": "data,service,cpu",
+        "help": "Write the lanes in images or a video as labels to correct.",
     },
     "train": {
         "target": "lanestream_exporter.training_commands:train",
@@ -40,8 +45,8 @@ COMMANDS: Final[Mapping[str, Mapping[str, str]]] = {
         "help": "Measure the accuracy of models and of tracking.",
     },
     "score": {
-        "target": "lanestream_exporter.evaluation_commands:score",
-        "extra": "export,service,cpu",
+        "target": "lanestream_exporter.score_commands:score",
+        "extra": "data",
         "help": "Measure a stream's results against labels.",
     },
 }

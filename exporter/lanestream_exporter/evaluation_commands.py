@@ -1,4 +1,4 @@
-"""The commands `evaluate`, `evaluate tracking` and `score`."""
+"""The commands `evaluate` and `evaluate tracking`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rich.console import Console
 from lanestream.errors import ModelError, needs_extra
 from lanestream.writing import check_file, check_folder, writing
 from lanestream_exporter.choices import CLIP_KINDS, LABEL_FORMATS
+from lanestream_exporter.label_option import LABEL_MAP
 
 if TYPE_CHECKING:
     from lanestream_exporter.datasets.splits import Split
@@ -51,6 +52,7 @@ _MIN_TRACKING_WIDTH: Final = 150
 @click.option(
     "--format", "format_name", type=click.Choice(LABEL_FORMATS), default="auto", help="The format of your labels."
 )
+@LABEL_MAP
 @click.option(
     "--labels-only", is_flag=True,
     help="Leave out the pictures without a road, the rendered towns and the stills.",
@@ -66,6 +68,7 @@ def evaluate(
     data: Path | None,
     manifest: Path | None,
     format_name: str,
+    labels: tuple[str, ...],
     labels_only: bool,
 ) -> None:
     """Evaluate model files and two classical baselines on labeled frames.
@@ -81,7 +84,7 @@ def evaluate(
     from lanestream_exporter.evaluation.tables import figure_tables
 
     _check_targets(out, json_path)
-    evaluation_set = _evaluation_set(data, manifest, format_name, split)
+    evaluation_set = _evaluation_set(data, manifest, format_name, labels, split)
     evaluation = run_evaluation(
         _methods(models, regressor),
         evaluation_set,
@@ -181,29 +184,24 @@ def evaluate_tracking(
             write_plots(plots, figures, runs)
 
 
-@click.command()
-@click.argument("results", type=click.Path(path_type=Path))
-@click.argument("labels", type=click.Path(path_type=Path))
-def score(results: Path, labels: Path) -> None:
-    """Evaluate RESULTS, a file that `stream --jsonl` wrote, against the LABELS of the clip."""
-    from lanestream_exporter.evaluation.score import score_results
-
-    click.echo(json.dumps(score_results(results, labels), indent=2))
-
-
-def _evaluation_set(data: Path | None, manifest: Path | None, format_name: str, split: Split) -> EvaluationSet:
+def _evaluation_set(
+    data: Path | None, manifest: Path | None, format_name: str, labels: tuple[str, ...], split: Split
+) -> EvaluationSet:
     """Returns a split of the manifest, or all labeled frames in `data` if it has none of the shipped data sets."""
     from lanestream_exporter.datasets.files import DataFolder
     from lanestream_exporter.datasets.formats import AUTO, format_of
+    from lanestream_exporter.datasets.label_map import LabelMap
     from lanestream_exporter.datasets.manifest import DatasetCollection
     from lanestream_exporter.datasets.reading import read_dataset
     from lanestream_exporter.evaluation.measuring import EvaluationSet
 
     datasets = DatasetCollection.open(manifest, data)
     if data is None or manifest is not None or (format_name == AUTO and datasets.any_present):
+        if labels:
+            raise click.UsageError("--label is for a folder of your own; a manifest has `labels`")
         return EvaluationSet.of_split(datasets, split)
-    name = format_of(DataFolder.at(data), format_name)
-    return EvaluationSet(data.name, lambda: read_dataset(data, name))
+    name, label_map = format_of(DataFolder.at(data), format_name), LabelMap.of(labels)
+    return EvaluationSet(data.name, lambda: read_dataset(data, name, label_map))
 
 
 def _refuse_options(context: click.Context) -> None:

@@ -22,6 +22,7 @@ import click
 
 from lanestream import __version__
 from lanestream.errors import CameraLostError, LanestreamError, missing_extra, needs_extra, needs_whole_packages
+from lanestream.host import memory, processors
 from lanestream.inference.providers import AUTO, PROVIDER_NAMES
 from lanestream.keys import new_key
 
@@ -34,6 +35,8 @@ _EXIT_CAMERA_LOST: Final = 3
 _EXIT_INTERRUPTED: Final = 130
 _EXIT_TERMINATED: Final = 143
 
+# The memory that a process with an engine may need for frames of any usual size.
+_ENGINE_BYTES: Final = 600e6
 # The extra that the commands of this package need when they run.
 _SERVICE_EXTRA: Final = "service,cpu"
 
@@ -60,6 +63,30 @@ class MountedCommand:
         module, _, name = self.target.partition(":")
         command: click.Command = getattr(import_module(module), name)
         return command
+
+
+class LocalEngines:
+    """Loads engines for the commands that work in this process; see LoadEngine in the client."""
+
+    def __call__(
+        self, model: Path | None, provider: str | None, regressor: Path | None, threads: int | None = None
+    ) -> LocalEngine:
+        """Returns a warm engine. Raises BadParameter, ModelError and ProviderError."""
+        chosen = next((known for known in PROVIDER_NAMES if known == (provider or AUTO)), None)
+        if chosen is None:
+            raise click.BadParameter(
+                f"{provider!r} is not one of {', '.join(PROVIDER_NAMES)}.",
+                ctx=click.get_current_context(silent=True),
+                param_hint="'--provider'",
+            )
+        with needs_extra(_SERVICE_EXTRA):
+            from lanestream.local import LocalEngine
+
+            return LocalEngine.load(model, chosen, regressor, threads)
+
+    def most_processes(self) -> int:
+        """Returns how many processes with an engine of one thread this machine has processors and memory for."""
+        return max(1, min(processors(), int(memory() / _ENGINE_BYTES)))
 
 
 class CommandGroup(click.Group):
@@ -120,7 +147,7 @@ _REGRESSOR: Final = click.option(
 @click.pass_context
 def cli(context: click.Context) -> None:
     """Camera frames in, tracked lane lines out."""
-    context.obj = _load_local_engine
+    context.obj = LocalEngines()
 
 
 @cli.command()
@@ -252,21 +279,6 @@ def _terminate(*_: object) -> None:
     os._exit(_EXIT_TERMINATED)
 
 
-def _load_local_engine(model: Path | None, provider: str | None, regressor: Path | None) -> LocalEngine:
-    """Loads an engine for the commands that work in this process; see LoadEngine in the client."""
-    chosen = next((known for known in PROVIDER_NAMES if known == (provider or AUTO)), None)
-    if chosen is None:
-        raise click.BadParameter(
-            f"{provider!r} is not one of {', '.join(PROVIDER_NAMES)}.",
-            ctx=click.get_current_context(),
-            param_hint="'--provider'",
-        )
-    with needs_extra(_SERVICE_EXTRA):
-        from lanestream.local import LocalEngine
-
-        return LocalEngine.load(model, chosen, regressor)
-
-
 def _load_overlay() -> Callable[..., Any] | None:
     """Returns the installed function that draws lanes on an image, or None if there is none."""
     for entry_point in entry_points(group=_OVERLAYS_GROUP):
@@ -276,4 +288,7 @@ def _load_overlay() -> Callable[..., Any] | None:
 
 
 if __name__ == "__main__":
-    main()
+    # Not this module under its other name, whose classes other processes can't import.
+    import lanestream.cli
+
+    lanestream.cli.main()

@@ -170,9 +170,21 @@ class SettingsError(LanestreamError):
 
 
 class SourceError(LanestreamError):
-    """A video source, image or folder can't be read, or a sink can't be written."""
+    """A video source, an image, a folder or another input can't be read, or an output can't be written."""
 
     code = "bad_source"
+
+
+class WriteError(SourceError):
+    """A file can't be written."""
+
+    code = "write_failed"
+
+
+class BatchError(LanestreamError):
+    """A batch can't start: its folder is in use, or has results of other settings."""
+
+    code = "batch_refused"
 
 
 class CameraLostError(SourceError):

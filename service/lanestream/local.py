@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from lanestream.engine import load_engine, resolve_regressor
 from lanestream.images.decoding import MOST_PIXELS, DecodedImage, ImageLimits, decode_reduced
+from lanestream.inference.providers import RuntimeOptions
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.protocol import warning_message
 from lanestream.road.view import WORKING_WIDTH
@@ -37,12 +38,15 @@ class LocalEngine:
         self._engine = engine
 
     @classmethod
-    def load(cls, model: Path | None, provider: str, regressor: Path | None = None) -> LocalEngine:
+    def load(
+        cls, model: Path | None, provider: str, regressor: Path | None = None, threads: int | None = None
+    ) -> LocalEngine:
         """Loads a model file and the regressor, by default the shipped ones; the path `none` omits the regressor.
 
-        Raises ModelError and ProviderError.
+        `threads` is the number of CPU threads of one run of a network; None: one for each processor. Raises ModelError
+        and ProviderError.
         """
-        return cls(load_engine(model, provider, resolve_regressor(regressor)))
+        return cls(load_engine(model, provider, resolve_regressor(regressor), RuntimeOptions(threads)))
 
     def network(self, detector: str | None = None) -> LoadedModel:
         """Returns the main model of `detector`, or of the default one. Raises NoDetectorError if it is not loaded."""

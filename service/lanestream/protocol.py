@@ -154,7 +154,9 @@ class StartMessage(StrictMessage):
     resume_token: Annotated[str, Field(max_length=128)] | None = Field(
         default=None, description="The token of `ready` or `draining` of the session to resume."
     )
-    mode: Mode = "latest"
+    mode: Mode = Field(
+        default="latest", description="`latest`: a newer frame replaces a waiting one; `all`: every frame is answered."
+    )
     detector: DetectorName | None = Field(
         default=None, description="The detector that finds the lanes; the service's default if missing."
     )
@@ -184,7 +186,9 @@ class FrameMessage(StrictMessage):
     replies = ("lanes", "error")
 
     type: Literal["frame"] = "frame"
-    seq: Annotated[int, Field(ge=0, le=MAX_SEQ)] | None = None
+    seq: Annotated[int, Field(ge=0, le=MAX_SEQ)] | None = Field(
+        default=None, description="Number of the frame; the previous one plus one if missing."
+    )
     timestamp: Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)] | None = Field(
         default=None, description="Capture time in seconds, on any clock that does not run backwards."
     )
@@ -220,31 +224,31 @@ class ReadyMessage(Message):
     """Service: the stream is open. `last_seq` is the last answered frame of a resumed session."""
 
     type: Literal["ready"] = "ready"
-    session: str
+    session: str = Field(description="Name of the session in the service's logs.")
     resume_token: str = Field(description="Resumes this session; keep it as secret as an API key.")
     resumed: bool = Field(description="Whether an earlier session continues; false for a new one.")
-    last_seq: int | None
-    mode: Mode
-    detector: str
-    model: str
-    provider: str
+    last_seq: int | None = Field(description="Number of the last answered frame of a resumed session.")
+    mode: Mode = Field(description="The mode of the stream.")
+    detector: str = Field(description="The detector that finds the lanes.")
+    model: str = Field(description="Name and version of its network.")
+    provider: str = Field(description="The execution provider that runs its network.")
     limits: Limits
 
 
 class LineModel(Message):
-    """The end points of a boundary: a straight line would join its lowest and its highest row."""
+    """The end points of a boundary, [x, y] in pixels: a straight line would join its lowest and its highest row."""
 
-    bottom: Point
-    top: Point
+    bottom: Point = Field(description="The point in the lowest row.")
+    top: Point = Field(description="The point in the highest row.")
 
 
 class MarkingModel(Message):
     """How a marking is painted, as all frames in which it was detected have shown so far."""
 
     type: MarkingType = Field(description="The most probable type; `dots` are raised dots.")
-    type_probability: float
+    type_probability: float = Field(description="Probability of this type.")
     color: MarkingColor = Field(description="The more probable color.")
-    color_probability: float
+    color_probability: float = Field(description="Probability of this color.")
     probability: float = Field(description="Probability that type and color are both right.")
 
 
@@ -254,13 +258,13 @@ class LaneModel(Message):
     The curve is valid between the rows of `line`. On a flat road it is a parabola on the ground, seen in perspective.
     """
 
-    track_id: int
+    track_id: int = Field(description="Identity of the boundary, which it keeps while it is tracked.")
     position: int = Field(description="-1 is ego left, +1 ego right, -2 and +2 are the next boundaries outwards.")
     state: Literal["detected", "inferred", "predicted"] = Field(
         description="`detected` in this frame, `inferred` from the road where little or no paint was seen, or"
         " `predicted` only."
     )
-    probability: float
+    probability: float = Field(description="Probability that it is a boundary.")
     kind: BoundaryKind = Field(
         default="marking", description="A `marking` on the road, or a `road_edge`: a curb, or where the pavement ends."
     )
@@ -268,12 +272,14 @@ class LaneModel(Message):
     marking: MarkingModel | None = Field(
         default=None, description="Null for a road edge, and if the model does not classify markings."
     )
-    points: list[Point] = Field(description="Points on the curve, from the lowest row to the highest.")
-    line: LineModel
-    horizon: float
-    coefficients: tuple[float, float, float]
-    covariance: list[list[float]] = Field(description="3 x 3 covariance of the coefficients.")
-    age_s: float
+    points: list[Point] = Field(description="Points [x, y] on the curve in pixels, from the lowest row to the highest.")
+    line: LineModel = Field(description="The end points of the curve.")
+    horizon: float = Field(description="Row of the horizon of the curve in pixels.")
+    coefficients: tuple[float, float, float] = Field(
+        description="[v, b, k] of the curve: v in pixels, b in pixels per row, k in square pixels."
+    )
+    covariance: list[list[float]] = Field(description="3 x 3 covariance of the coefficients, in their units.")
+    age_s: float = Field(description="Seconds since its track began.")
     ground: tuple[float, float, float] | None = Field(
         default=None,
         description="[a, b, c] of Y = a X^2 + b X + c on the road, in meters: X forward of the camera, Y left of the"
@@ -299,28 +305,32 @@ class EgoModel(Message):
     are known, `heading` and `curvature` if at least one is. Each has its standard deviation in `..._sigma`.
     """
 
-    left: int | None
-    right: int | None
+    left: int | None = Field(description="Track id of the left boundary; null without one.")
+    right: int | None = Field(description="Track id of the right boundary; null without one.")
     left_kind: BoundaryKind | None = Field(default=None, description="Kind of the left boundary; null without one.")
     right_kind: BoundaryKind | None = Field(default=None, description="Kind of the right boundary; null without one.")
-    offset: float | None
-    offset_sigma: float | None = None
+    offset: float | None = Field(
+        description="Distance of the camera from the center of the lane as a share of its width, positive to the right."
+    )
+    offset_sigma: float | None = Field(default=None, description="Standard deviation of `offset`.")
     offset_m: float | None = Field(default=None, description="Offset in meters, positive to the right of the center.")
-    offset_m_sigma: float | None = None
+    offset_m_sigma: float | None = Field(default=None, description="Standard deviation of `offset_m` in meters.")
     lane_width_m: float | None = Field(default=None, description="Lane width in meters.")
-    lane_width_m_sigma: float | None = None
+    lane_width_m_sigma: float | None = Field(
+        default=None, description="Standard deviation of `lane_width_m` in meters."
+    )
     heading: float | None = Field(
         default=None, description="Angle from the vehicle's heading to the lane's in radians, positive to the left."
     )
-    heading_sigma: float | None = None
+    heading_sigma: float | None = Field(default=None, description="Standard deviation of `heading` in radians.")
     curvature: float | None = Field(
         default=None, description="Curvature of the lane in 1/m, positive if it curves to the left."
     )
-    curvature_sigma: float | None = None
+    curvature_sigma: float | None = Field(default=None, description="Standard deviation of `curvature` in 1/m.")
     lateral_speed: float | None = Field(
         default=None, description="Speed of the vehicle across its lane in m/s, positive to the right."
     )
-    lateral_speed_sigma: float | None = None
+    lateral_speed_sigma: float | None = Field(default=None, description="Standard deviation of `lateral_speed` in m/s.")
 
 
 class DepartureModel(Message):
@@ -341,10 +351,10 @@ class DepartureModel(Message):
 class CalibrationModel(Message):
     """The estimated direction of the camera in degrees, if `start` had `auto` for its pitch or its yaw."""
 
-    pitch: float = Field(description="Pitch of the camera, positive if it looks down.")
-    pitch_sigma: float
-    yaw: float = Field(description="Yaw of the camera, positive if it looks to the left.")
-    yaw_sigma: float
+    pitch: float = Field(description="Pitch of the camera in degrees, positive if it looks down.")
+    pitch_sigma: float = Field(description="Standard deviation of the pitch in degrees.")
+    yaw: float = Field(description="Yaw of the camera in degrees, positive if it looks to the left.")
+    yaw_sigma: float = Field(description="Standard deviation of the yaw in degrees.")
     settled: bool = Field(description="Whether the estimate is good enough to be used.")
 
 
@@ -352,8 +362,8 @@ class LaneChangeModel(Message):
     """The vehicle's middle, or the camera if that is unknown, crossed a lane boundary."""
 
     type: Literal["lane_change"] = "lane_change"
-    track_id: int
-    direction: Side
+    track_id: int = Field(description="Track id of the boundary.")
+    direction: Side = Field(description="The side to which the vehicle changes.")
     timestamp: float = Field(description="Time of the crossing, interpolated between frames.")
 
 
@@ -361,9 +371,9 @@ class DepartureEventModel(Message):
     """A departure warning began, or the vehicle's wheels crossed a boundary of its lane."""
 
     type: Literal["departure"] = "departure"
-    state: Literal["warning", "crossed"]
-    side: Side
-    track_id: int
+    state: Literal["warning", "crossed"] = Field(description="What began: a warning, or a crossing.")
+    side: Side = Field(description="The side of the boundary.")
+    track_id: int = Field(description="Track id of the boundary.")
     timestamp: float = Field(description="Time of the warning or the crossing, interpolated between frames.")
 
 
@@ -371,16 +381,16 @@ class SceneCutModel(Message):
     """The frame shows another scene than the one before: all track ids are new."""
 
     type: Literal["scene_cut"] = "scene_cut"
-    timestamp: float
+    timestamp: float = Field(description="Time of the first frame of the new scene.")
 
 
 class CalibrationChangedModel(Message):
     """The camera points in another direction than before, in degrees."""
 
     type: Literal["calibration_changed"] = "calibration_changed"
-    pitch: float
-    yaw: float
-    timestamp: float
+    pitch: float = Field(description="The new pitch in degrees, positive if the camera looks down.")
+    yaw: float = Field(description="The new yaw in degrees, positive if the camera looks to the left.")
+    timestamp: float = Field(description="Time of the frame in which it was noticed.")
 
 
 EventModel = LaneChangeModel | DepartureEventModel | SceneCutModel | CalibrationChangedModel
@@ -402,12 +412,12 @@ class LanesMessage(Message):
     """Service: the lanes of one frame."""
 
     type: Literal["lanes"] = "lanes"
-    seq: int
-    timestamp: float
-    width: int
-    height: int
-    horizon: float
-    lanes: list[LaneModel]
+    seq: int = Field(description="Number of the frame.")
+    timestamp: float = Field(description="Capture time of the frame in seconds.")
+    width: int = Field(description="Width of the image in pixels.")
+    height: int = Field(description="Height of the image in pixels.")
+    horizon: float = Field(description="Row of the horizon in this frame in pixels.")
+    lanes: list[LaneModel] = Field(description="The reported boundaries.")
     ego: EgoModel
     departure: DepartureModel | None = Field(default=None, description="Null without a camera.")
     calibration: CalibrationModel | None = Field(
@@ -433,11 +443,11 @@ class ErrorMessage(Message):
     }
 
     type: Literal["error"] = "error"
-    code: str
-    message: str
-    hint: str = ""
-    seq: int | None = None
-    fatal: bool = False
+    code: str = Field(description="The kind of error, for programs; never changes its meaning.")
+    message: str = Field(description="What is wrong, for people.")
+    hint: str = Field(default="", description="What to do, for people.")
+    seq: int | None = Field(default=None, description="The frame that the error answers; null if none.")
+    fatal: bool = Field(default=False, description="Whether the service closes the stream.")
 
 
 class WarningMessage(Message):
@@ -452,9 +462,9 @@ class WarningMessage(Message):
     }
 
     type: Literal["warning"] = "warning"
-    code: WarningCode
-    message: str
-    hint: str
+    code: WarningCode = Field(description="The kind of warning, for programs.")
+    message: str = Field(description="What is probably wrong, for people.")
+    hint: str = Field(description="What to do, for people.")
     seq: int = Field(description="The frame that showed it.")
 
 
@@ -495,11 +505,11 @@ class SummaryMessage(Message):
     example = {"type": "summary", "frames": 250, "answered": 248, "failed": 1, "dropped": 1, "duration_s": 10.02}
 
     type: Literal["summary"] = "summary"
-    frames: int
-    answered: int
-    failed: int
-    dropped: int
-    duration_s: float
+    frames: int = Field(description="Frames received.")
+    answered: int = Field(description="Frames answered with lanes.")
+    failed: int = Field(description="Frames answered with an error.")
+    dropped: int = Field(description="Frames without an answer, because newer ones replaced them.")
+    duration_s: float = Field(description="Seconds since the socket was opened.")
 
 
 ClientMessage = StartMessage | FrameMessage | EndMessage

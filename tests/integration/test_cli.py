@@ -46,7 +46,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
         return int(caught.value.code or 0), output, errors
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(LocalEngine, "load", lambda _model, _provider, regressor: LocalEngine(load(regressor)))
+    monkeypatch.setattr(
+        LocalEngine, "load", lambda _model, _provider, regressor, _threads: LocalEngine(load(regressor))
+    )
     return call
 
 
@@ -72,7 +74,20 @@ def test_help_needs_no_extra() -> None:
     shown = subprocess.run(
         [sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True, timeout=30
     )
-    for name in ("serve", "key", "doctor", "detect", "stream", "scene", "data", "train", "export", "evaluate", "score"):
+    for name in (
+        "serve",
+        "key",
+        "doctor",
+        "batch",
+        "detect",
+        "stream",
+        "scene",
+        "data",
+        "train",
+        "export",
+        "evaluate",
+        "score",
+    ):
         assert re.search(rf"^  {name}  +[A-Z].+\.$", shown.stdout, re.MULTILINE), f"{name} has a line of help"
     for arguments in (["detect", "x.jpg"], ["scene", "x.mp4"], ["doctor"], ["serve"]):
         refused = subprocess.run(
@@ -385,14 +400,17 @@ def test_an_invalid_environment_variable_is_reported(run: Run, monkeypatch: pyte
 
 
 def test_settings_are_printed_without_their_secrets(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("lanestream.toml").write_text('redis_url = "redis://:secret@host/0"\nport = 8123\n')
+    Path("lanestream.toml").write_text('redis_url = "redis://:hunter2@host/0"\nport = 8123\n')
+    monkeypatch.setenv("LANESTREAM_TOKEN_SECRET", "signs tokens " * 4)
     monkeypatch.setenv("LANESTREAM_API_KEYS", f"camera-7:{'5ec7e7' * 10}0123")
     code, output, errors = run("serve", "--config", "lanestream.toml", "--host", "::1", "--print-config")
     assert (code, errors) == (0, "")
     lines = output.splitlines()
     for line in ('host = "::1"', "port = 8123", 'api_keys = ["camera-7:***"]', 'redis_url = "redis://***@host/0"'):
         assert line in lines
-    assert "secret" not in output
+    assert "hunter2" not in output
+    assert "signs tokens " * 4 not in output
+    assert 'token_secret = "***"' in lines
     assert "5ec7e7" not in output
 
 

@@ -91,12 +91,13 @@ def test_every_command_has_help(hidden: list[str]) -> None:
         ("stream 0", "video"),
         ("scene x.mp4", "video"),
         ("calibrate x --height 1.4 -o camera.json", "service,cpu"),
-        ("data check x", "export"),
+        ("data check x", "data"),
+        ("label x out --format cvat", "data,service,cpu"),
         ("train classifier --run x", "train,service,cpu"),
         ("export x.pt x.onnx", "export,service,cpu"),
         ("evaluate", "export,service,cpu"),
         ("evaluate tracking", "export,service,cpu"),
-        ("score x y", "export,service,cpu"),
+        ("score x y", "data"),
     ],
 )
 def test_without_its_extra_a_command_says_what_to_install(arguments: str, extra: str) -> None:

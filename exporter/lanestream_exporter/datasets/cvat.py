@@ -1,6 +1,7 @@
 """Reads CVAT's labels, "CVAT for images 1.1" and "CVAT for video 1.1". Polylines in the XML file are lane boundaries.
 
-Polygons, points and skeletons are converted as `shapes` explains, and `cvat_frames` finds the images. The attributes
+Labels mean what `label_map` says. Polygons, points and skeletons are converted as `shapes` explains, and `cvat_frames`
+finds the images. The attributes
 `type` (or `kind`), `color` (or `colour`), `position` and `id` of a shape are used; words of its label stand in for the
 first two. A track's id is the boundary's id. Coordinates are taken as written.
 Format: docs.cvat.ai/docs/dataset_management/formats/format-cvat and docs.cvat.ai/docs/other/xml_format.
@@ -20,10 +21,11 @@ from defusedxml.ElementTree import parse
 
 from lanestream.errors import LabelError
 from lanestream_exporter.datasets.cvat_frames import CvatExport, CvatFrame, frame_number
-from lanestream_exporter.datasets.entries import LabeledLook, LabelEntries, LabelEntry, size_of
+from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, size_of
 from lanestream_exporter.datasets.files import DataFolder, error_at, field_error
+from lanestream_exporter.datasets.label_map import LabelMap
 from lanestream_exporter.datasets.labels import LabeledLane, points_of
-from lanestream_exporter.datasets.shapes import DrawnBoundaries, DrawnShape, may_be_boundary, no_boundaries, words_of
+from lanestream_exporter.datasets.shapes import DrawnBoundaries, DrawnShape, meaning_of, no_boundaries
 
 _SHAPES: Final = frozenset({"polyline", "box", "polygon", "points", "cuboid", "skeleton", "ellipse", "mask"})
 _WITH_POINTS: Final = frozenset({"polyline", "polygon", "points", "skeleton"})
@@ -36,7 +38,7 @@ def is_cvat(path: Path, start: bytes) -> bool:
     return path.suffix.lower() == ".xml" and b"<annotations" in start
 
 
-def cvat_entries(folder: DataFolder) -> LabelEntries:
+def cvat_entries(folder: DataFolder, labels: LabelMap) -> LabelEntries:
     """Yields the frames of all XML files.
 
     A group is the folder of the images if their names have one, else the name of the task; of a video task, the video.
@@ -49,8 +51,8 @@ def cvat_entries(folder: DataFolder) -> LabelEntries:
             yield error
             continue
         export = CvatExport(path, root, folder)
-        yield from _image_entries(export)
-        yield from _track_entries(export)
+        yield from _image_entries(export, labels)
+        yield from _track_entries(export, labels)
 
 
 def _root(path: Path) -> Element:
@@ -67,14 +69,14 @@ def _root(path: Path) -> Element:
     return root
 
 
-def _image_entries(export: CvatExport) -> LabelEntries:
+def _image_entries(export: CvatExport, labels: LabelMap) -> LabelEntries:
     left_out: Counter[str] = Counter()
     is_empty = True
     for image in export.root.iterfind("image"):
         location = f"{export.path}: image {image.get('name')}"
         try:
-            size, drawn = _drawn_on(image)
-            if frame_number(image.attrib["name"]) is not None and not drawn.lanes:
+            size, drawn = _drawn_on(image, labels)
+            if frame_number(image.attrib["name"]) is not None and not drawn.lanes and not drawn.unknown:
                 left_out.update(drawn.others)
                 continue
             task = export.task(int(image.get("task_id", 0)))
@@ -89,7 +91,7 @@ def _image_entries(export: CvatExport) -> LabelEntries:
         yield no_boundaries(export.path, left_out)
 
 
-def _drawn_on(image: Element) -> tuple[tuple[int, int], DrawnBoundaries]:
+def _drawn_on(image: Element, labels: LabelMap) -> tuple[tuple[int, int], DrawnBoundaries]:
     """Returns the size of an image and the boundaries that were drawn on it."""
     size = size_of(image.attrib["width"], image.attrib["height"])
     counts: Counter[str] = Counter()
@@ -97,52 +99,48 @@ def _drawn_on(image: Element) -> tuple[tuple[int, int], DrawnBoundaries]:
     for element in image:
         if element.tag in _SHAPES:
             counts[element.tag] += 1
-            shapes.append(_shape(element, f"{element.tag} {counts[element.tag]}", element.get("label", ""), None))
+            where = f"{element.tag} {counts[element.tag]}"
+            shapes.append(_shape(element, where, element.get("label", ""), None, labels))
     return size, DrawnBoundaries.of(shapes, "CVAT", size[0])
 
 
 def _entry(location: str, frame: CvatFrame, drawn: DrawnBoundaries, size: tuple[int, int] | None) -> LabelEntry:
     return LabelEntry(
         location, frame.source, frame.group, frame.image, drawn.lanes, size, frame.video, frame.index,
-        converted=drawn.converted, others=drawn.others,
+        converted=drawn.converted, others=drawn.others, unknown=drawn.unknown,
     )  # fmt: skip
 
 
-def _shape(element: Element, where: str, label: str, lane_id: int | None) -> DrawnShape:
+def _shape(element: Element, where: str, label: str, lane_id: int | None, labels: LabelMap) -> DrawnShape:
+    meaning = meaning_of(element.tag, label, labels)
     # The points of a skeleton are elements of their own.
     parts = list(element.iterfind("points")) if element.tag == "skeleton" else [element]
-    texts = [part.attrib["points"] for part in parts if part.get("outside") != "1"] if _matters(element, label) else []
+    matters = meaning != "ignore" and element.tag in _WITH_POINTS
+    texts = [part.attrib["points"] for part in parts if part.get("outside") != "1"] if matters else []
     try:
         points = points_of([[float(n) for n in pair.split(",")] for text in texts for pair in text.split(";") if pair])
     except ValueError:
         raise ValueError(f"{where}: its points are not pairs of numbers") from None
     attributes = {str(a.get("name")).lower(): (a.text or "").strip().lower() for a in element.iterfind("attribute")}
-    words = words_of(label)
-    look = LabeledLook.of(
-        [attributes.get("type", ""), attributes.get("kind", ""), *words],
-        [attributes.get("color", ""), attributes.get("colour", ""), *words],
-    )
+    types, colors = ([attributes.get(name, "") for name in names] for names in (("type", "kind"), ("color", "colour")))
+    look = labels.look(label, types, colors)
     position = attributes.get("position", "")
     if lane_id is None and attributes.get("id", "").isdecimal():
         lane_id = int(attributes["id"])
     lane_position = int(position) if _POSITION.fullmatch(position) else None
     lane = LabeledLane(points, lane_id, lane_position, look.type, look.color, look.default_kind)
     group = element.get("group_id", "0")
-    return DrawnShape(where, element.tag, label, lane, lane_id if group == "0" else group)
+    return DrawnShape(where, element.tag, label, meaning, lane, lane_id if group == "0" else group)
 
 
-def _matters(element: Element, label: str) -> bool:
-    return may_be_boundary(element.tag, label) and element.tag in _WITH_POINTS
-
-
-def _track_entries(export: CvatExport) -> LabelEntries:
+def _track_entries(export: CvatExport, labels: LabelMap) -> LabelEntries:
     """Yields the frames in which a track has a visible shape that is a boundary."""
     frames: dict[int, list[DrawnShape]] = {}
     others: Counter[str] = Counter()
-    for found in _track_shapes(export):
+    for found in _track_shapes(export, labels):
         if isinstance(found, LabelError):
             yield found
-        elif may_be_boundary(found[1].tool, found[1].label):
+        elif found[1].meaning != "ignore":
             frames.setdefault(found[0], []).append(found[1])
         else:
             others[found[1].name] += 1
@@ -169,7 +167,7 @@ def _track_entries(export: CvatExport) -> LabelEntries:
             yield error_at(location, error)
 
 
-def _track_shapes(export: CvatExport) -> Iterator[tuple[int, DrawnShape] | LabelError]:
+def _track_shapes(export: CvatExport, labels: LabelMap) -> Iterator[tuple[int, DrawnShape] | LabelError]:
     """Yields the visible shapes of all tracks with their frames, and faulty ones as their errors."""
     for track in export.root.iterfind("track"):
         where = f"track {track.get('id')}"
@@ -177,7 +175,7 @@ def _track_shapes(export: CvatExport) -> Iterator[tuple[int, DrawnShape] | Label
             if element.tag not in _SHAPES or element.get("outside") == "1":
                 continue
             try:
-                shape = _shape(element, where, track.get("label", ""), int(track.attrib["id"]))
+                shape = _shape(element, where, track.get("label", ""), int(track.attrib["id"]), labels)
                 yield int(element.attrib["frame"]), shape
             except (ValueError, KeyError) as error:
                 yield field_error(f"{export.path}: {where}", error, "an id, and polylines with frame and points")

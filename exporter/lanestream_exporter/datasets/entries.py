@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from lanestream.errors import LabelError
 from lanestream.road.appearance import MARKING_COLORS, BoundaryKind
-from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.images import ImageLocation
 from lanestream_exporter.datasets.labels import LANE_TYPES, PARTIAL, ROAD_EDGE_TYPES, Coverage, LabeledLane
 
@@ -26,6 +25,7 @@ _OTHER_COLORS: Final = frozenset(
     {"blue", "red", "orange", "green"}
 )  # of paint that counts as a marking without a color
 _UNPAINTED: Final = "none"
+_MARKING: Final = "marking"
 UNKNOWN: Final = "unknown"
 _LONGEST_SIDE: Final = 1 << 20  # pixels
 
@@ -41,8 +41,8 @@ class LabelEntry:
     `size` is the (width, height) of the image if the labels give it. `video` and `index` name the video that the frame
     was taken from and its number there, if known. `split` is the record's own split. `extends_beyond_image` is true
     for formats whose boundaries run on outside the image. `converted` names the tools of the boundaries that were not
-    drawn as lines, and `others` names labeled shapes that are not boundaries. `fields` has the record's own words and
-    numbers, such as the light.
+    drawn as lines, `others` names labeled shapes that are not boundaries, and `unknown` has the labels of lines that
+    may be some. `fields` has the record's own words and numbers, such as the light.
 
     The manifest adds what it says about the whole data set: its name, the `coverage` of its labels, the `horizon` as a
     share of the height, and `masks`, boxes (left, top, right, bottom) in shares of width and height that are not road.
@@ -60,6 +60,7 @@ class LabelEntry:
     extends_beyond_image: bool = False
     converted: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
     fields: Mapping[str, FieldValue] = field(default_factory=dict)
     dataset: str = ""
     coverage: Coverage = PARTIAL
@@ -68,17 +69,6 @@ class LabelEntry:
 
 
 LabelEntries = Iterator[LabelEntry | LabelError]
-
-
-@dataclass(frozen=True)
-class LabelFormat:
-    """A label format: `read` yields the entries of a data set.
-
-    `recognizes` says whether a file holds such labels, by its path and the first bytes of a JSON or XML file.
-    """
-
-    read: Callable[[DataFolder], LabelEntries]
-    recognizes: Callable[[Path, bytes], bool]
 
 
 def numbered(lanes: Iterable[LabeledLane], noun: str = "lane") -> dict[str, LabeledLane]:
@@ -99,26 +89,27 @@ class LabeledLook:
         """Returns the look that lower-case words describe, which may be the same for type and color.
 
         An edge of the road has no paint: the color "none" makes a boundary of unknown type an edge. An edge whose color
-        is unknown may be painted, so nothing is known about it.
+        is unknown may be painted, so nothing is known about it. The type "marking" is any painted line.
         """
-        colors = set(color_words)
-        named = next((_TYPES[word] for word in type_words if word in _TYPES), None)
+        types, colors = list(type_words), set(color_words)
+        named = next((_TYPES[word] for word in types if word in _TYPES), None)
         if named in ROAD_EDGE_TYPES:
             return cls() if UNKNOWN in colors else cls(named)
         if named is None and _UNPAINTED in colors:
             return cls("edge")
         color = next((name for name in MARKING_COLORS if name in colors), None)
-        return cls(named, color, None if colors.isdisjoint(_OTHER_COLORS) else "marking")
+        is_painted = _MARKING in types or not colors.isdisjoint(_OTHER_COLORS)
+        return cls(named, color, "marking" if is_painted else None)
 
 
 def is_type(word: str) -> bool:
     """Whether `word` names the type of a boundary, or says that it is unknown."""
-    return is_boundary_type(word) or word == UNKNOWN
+    return word in _TYPES or word == UNKNOWN
 
 
-def is_boundary_type(word: str) -> bool:
-    """Whether a lower-case word names the type of a boundary."""
-    return word in _TYPES
+def boundary_type(word: str) -> str | None:
+    """Returns the type of a boundary, one of LANE_TYPES, that a lower-case word names; None if it names none."""
+    return _TYPES.get(word)
 
 
 def size_of(width: Any, height: Any) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import json
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,6 +88,11 @@ class DataFolder:
         return _normalized(path).relative_to(_normalized(self.root)).as_posix()
 
 
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Returns what to sort file names by, so that 2.jpg comes before 10.jpg."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name.lower())]
+
+
 def drive_of(folder: Path) -> str:
     """Returns the name of the drive or clip whose images are in `folder`, whichever path leads there.
 
@@ -161,15 +167,20 @@ def start_of(path: Path) -> bytes:
 
 def json_object(text: str, location: str, accepted: str) -> dict[str, Any]:
     """Returns the JSON object in `text`. Raises LabelError that names the `location` and what is `accepted` there."""
+    found = json_value(text, location, accepted)
+    if not isinstance(found, dict):
+        raise LabelError(f"{location}: not a JSON object", accepted)
+    return found
+
+
+def json_value(text: str, location: str, accepted: str) -> Any:
+    """Returns the JSON value in `text`. Raises LabelError that names the `location` and what is `accepted` there."""
     try:
-        found = json.loads(text)
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise LabelError(f"{location}: not JSON: {error.msg}", accepted) from None
     except (RecursionError, ValueError):
         raise LabelError(f"{location}: not readable JSON: nested too deeply, or a number too long", accepted) from None
-    if not isinstance(found, dict):
-        raise LabelError(f"{location}: not a JSON object", accepted)
-    return found
 
 
 def error_at(location: str, error: LanestreamError) -> LabelError:

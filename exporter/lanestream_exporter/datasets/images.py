@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Self
@@ -16,6 +17,8 @@ import numpy as np  # isort: skip
 
 # More than the service accepts: labeled frames may come from any camera, and as PNG files.
 LIMITS: Final = ImageLimits(max_bytes=64 << 20, max_pixels=MOST_PIXELS // 2)
+EVERY_FRAME: Final = range(1 << 31)
+_USUAL_FPS: Final = 25.0  # of videos that don't say
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,26 @@ def video_size(video: Path) -> tuple[int, int]:
         if not capture.isOpened():
             raise SourceError(f"{video} can't be read as a video", "give the path of a video file")
         return int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    finally:
+        capture.release()
+
+
+def decoded_frames(video: Path, frames: range = EVERY_FRAME) -> Iterator[tuple[int, Image, float]]:
+    """Yields those `frames` of a video that it has, with their index and their time in seconds.
+
+    Raises SourceError if it can't be read.
+    """
+    capture = cv2.VideoCapture(str(video))
+    if not capture.isOpened():
+        raise SourceError(f"{video} can't be read as a video", "give the path of a video file")
+    fps = capture.get(cv2.CAP_PROP_FPS) or _USUAL_FPS
+    capture.set(cv2.CAP_PROP_POS_FRAMES, frames.start)
+    try:
+        for index in frames:
+            ok, image = capture.read()
+            if not ok:
+                return
+            yield index, np.asarray(image, dtype=np.uint8), index / fps
     finally:
         capture.release()
 

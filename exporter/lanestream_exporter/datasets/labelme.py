@@ -1,8 +1,8 @@
 """Reads LabelMe's labels: one JSON file per image. Line strips and lines among its `shapes` are lane boundaries.
 
-Polygons and points are converted as `shapes` explains. A shape's `group_id` is the boundary's id; words of its `label`
-and its `flags` may name type and color ("dashed", "white"). The image is at `imagePath`, next to the JSON file under
-that name, or inside it as `imageData`. Coordinates are taken as written.
+Their labels mean what `label_map` says. Polygons and points are converted as `shapes` explains. A shape's `group_id` is
+the boundary's id; words of its `flags` and its `label` may name type and color ("dashed", "white"). The image is at
+`imagePath`, next to the JSON file under that name, or inside it as `imageData`. Coordinates are taken as written.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lanestream.errors import LabelError
-from lanestream_exporter.datasets.entries import LabeledLook, LabelEntries, LabelEntry, size_of
+from lanestream_exporter.datasets.entries import LabelEntries, LabelEntry, size_of
 from lanestream_exporter.datasets.files import (
     DataFolder,
     drive_of,
@@ -24,8 +24,9 @@ from lanestream_exporter.datasets.files import (
     read_text,
 )
 from lanestream_exporter.datasets.images import ImageLocation
+from lanestream_exporter.datasets.label_map import LabelMap, words_of
 from lanestream_exporter.datasets.labels import LabeledLane, points_of
-from lanestream_exporter.datasets.shapes import DrawnBoundaries, DrawnShape, may_be_boundary, words_of
+from lanestream_exporter.datasets.shapes import DrawnBoundaries, DrawnShape, meaning_of
 
 _ACCEPTED: Final = "a JSON file of LabelMe is accepted"
 
@@ -36,7 +37,7 @@ def is_labelme(path: Path, start: bytes) -> bool:
     return path.suffix.lower() in (".json", ".jsonl") and any(key in start for key in keys)
 
 
-def labelme_entries(folder: DataFolder) -> LabelEntries:
+def labelme_entries(folder: DataFolder, labels: LabelMap) -> LabelEntries:
     """Yields the frames of all JSON files. A group is the folder of the images."""
     for path in folder.with_suffix(".json"):
         try:
@@ -45,38 +46,39 @@ def labelme_entries(folder: DataFolder) -> LabelEntries:
             yield error
             continue
         try:
-            yield _entry(record, path, folder)
+            yield _entry(record, path, folder, labels)
         except (ValueError, KeyError, TypeError, OverflowError, AttributeError) as error:
             yield field_error(str(path), error, "imagePath and shapes, each with label, shape_type and points")
         except LabelError as error:
             yield error_at(str(path), error)
 
 
-def _entry(record: dict[str, Any], path: Path, folder: DataFolder) -> LabelEntry:
+def _entry(record: dict[str, Any], path: Path, folder: DataFolder, labels: LabelMap) -> LabelEntry:
     image = _image(record, path, folder)
     width, height = record.get("imageWidth"), record.get("imageHeight")
     size = size_of(width, height) if width and height else None
-    shapes = [_shape(shape, f"shape {number}") for number, shape in enumerate(record["shapes"], start=1)]
+    shapes = [_shape(shape, f"shape {number}", labels) for number, shape in enumerate(record["shapes"], start=1)]
     drawn = DrawnBoundaries.of(shapes, "LabelMe", size[0] if size else None)
     source, group = folder.name(image.path), drive_of(image.path.parent)
     return LabelEntry(
-        str(path), source, group, image, drawn.lanes, size, converted=drawn.converted, others=drawn.others
-    )
+        str(path), source, group, image, drawn.lanes, size,
+        converted=drawn.converted, others=drawn.others, unknown=drawn.unknown,
+    )  # fmt: skip
 
 
-def _shape(shape: dict[str, Any], where: str) -> DrawnShape:
+def _shape(shape: dict[str, Any], where: str, labels: LabelMap) -> DrawnShape:
     tool, label = str(shape.get("shape_type") or "polygon"), str(shape.get("label") or "")
+    meaning = meaning_of(tool, label, labels)
     try:
-        points = points_of(shape["points"] if may_be_boundary(tool, label) else [])
+        points = points_of([] if meaning == "ignore" else shape["points"])
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
-    flags = " ".join(name for name, is_set in (shape.get("flags") or {}).items() if is_set)
-    words = words_of(f"{label} {flags}")
-    look = LabeledLook.of(words, words)
+    flags = words_of(" ".join(name for name, is_set in (shape.get("flags") or {}).items() if is_set))
+    look = labels.look(label, flags, flags)
     group = shape.get("group_id")
     lane_id = None if group is None else int(group)
     lane = LabeledLane(points, lane_id, None, look.type, look.color, look.default_kind)
-    return DrawnShape(where, tool, label, lane, lane_id)
+    return DrawnShape(where, tool, label, meaning, lane, lane_id)
 
 
 def _image(record: dict[str, Any], path: Path, folder: DataFolder) -> ImageLocation:

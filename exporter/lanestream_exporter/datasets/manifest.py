@@ -23,6 +23,7 @@ from lanestream_exporter.datasets.entries import FieldValue, LabelEntry
 from lanestream_exporter.datasets.files import DataFolder
 from lanestream_exporter.datasets.formats import AUTO, FORMATS
 from lanestream_exporter.datasets.images import ImageReader, video_size
+from lanestream_exporter.datasets.label_map import LabelMap
 from lanestream_exporter.datasets.label_propagation import LabelPropagation
 from lanestream_exporter.datasets.labels import Coverage, LabeledFrame, LabeledImages, LabeledLane
 from lanestream_exporter.datasets.reading import labeled_frame, open_entry, read_entries
@@ -39,7 +40,8 @@ from lanestream_exporter.datasets.splits import (
 from lanestream_exporter.toml_files import CONFIG_FOLDER, Section, Share, read_toml
 
 SHIPPED_MANIFEST: Final = CONFIG_FOLDER / "datasets.toml"
-_SHIPPED_DATA: Final = Path("../shared/data")
+SHIPPED_DATA: Final = Path("../shared/data")
+_FETCH: Final = "`lanestream data fetch` shows where it comes from; name its folder with --data or LANESTREAM_DATA"
 _SIDES: Final = {"left": -1, "right": 1}
 _HORIZON_SHARES: Final = (-0.6, 1.0)  # of the height; the camera looks down if it is negative
 
@@ -61,10 +63,11 @@ class CoverageSection(Section):
 class DatasetSpec(Section):
     """One data set of a manifest: a folder or a label file, its split rule, and whom to credit for it.
 
-    `default_kind` is that of labels without type and color. `group` and `horizon` name the field of a record with the
-    drive, and the one with the horizon's row as a share of the height. Records with one of the fields `skip` are left
-    out. In records whose fields have one of the values in `ignore_colors`, colors are not trusted. `masks` are boxes
-    (left, top, right, bottom) in shares of width and height, such as logos; they are painted over in still images.
+    `labels` says what the labels of a drawing program mean, and `default_kind` is that of boundaries without type and
+    color. `group` and `horizon` name the field of a record with the drive, and the one with the horizon's row as a
+    share of the height. Records with one of the fields `skip` are left out. In records whose fields have one of the
+    values in `ignore_colors`, colors are not trusted. `masks` are boxes (left, top, right, bottom) in shares of width
+    and height, such as logos; they are painted over in still images.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -73,6 +76,7 @@ class DatasetSpec(Section):
     split: SplitField
     group: str | None = None
     coverage: CoverageSection = CoverageSection()
+    labels: LabelMap = LabelMap()
     default_kind: BoundaryKind | None = None
     horizon: str | None = None
     skip: tuple[str, ...] = ()
@@ -157,10 +161,14 @@ class LabeledClip:
 
 @dataclass(frozen=True)
 class DatasetCollection:
-    """The data sets of a manifest in a data folder, with their frames by split."""
+    """The data sets of a manifest in a data folder, with their frames by split.
+
+    `is_shipped` is true for the shipped manifest, whose data sets are public.
+    """
 
     manifest: DatasetManifest
     root: Path
+    is_shipped: bool = False
 
     @classmethod
     def open(cls, manifest: Path | None = None, data: Path | None = None) -> DatasetCollection:
@@ -171,9 +179,8 @@ class DatasetCollection:
         """
         path = manifest or SHIPPED_MANIFEST
         read = read_toml(path, DatasetManifest, "give a manifest of data sets, a TOML file")
-        named = data or os.environ.get("LANESTREAM_DATA")
-        default = _SHIPPED_DATA if manifest is None else path.parent
-        return cls(read, Path(named) if named else default)
+        root = data_folder(data, SHIPPED_DATA if manifest is None else path.parent)
+        return cls(read, root, is_shipped=manifest is None)
 
     def without(self, names: Collection[str]) -> DatasetCollection:
         """Returns the collection without the data sets of these names. Raises SettingsError for an unknown name."""
@@ -261,7 +268,7 @@ class DatasetCollection:
 
     def _read(self, spec: DatasetSpec) -> Iterator[LabelEntry]:
         """Yields the records of a data set without opening its images."""
-        for entry in read_entries(self._path(spec), spec.format):
+        for entry in read_entries(self._path(spec), spec.format, spec.labels):
             if isinstance(entry, LabelError):
                 raise entry
             if not any(name in entry.fields for name in spec.skip):
@@ -273,10 +280,10 @@ class DatasetCollection:
     def _path(self, spec: DatasetSpec) -> Path:
         path = self.root / spec.path
         if not self._is_present(spec):
-            raise LabelError(
-                f"the data set {spec.name!r} is missing: there is nothing at {path}",
-                "give the folder that the manifest's paths count from with --data or LANESTREAM_DATA",
-            )
+            hint = "give the folder that the manifest's paths count from with --data or LANESTREAM_DATA"
+            # The usual folder of the shipped data sets is not one that the user named.
+            where = "" if self.root == SHIPPED_DATA else f": there is nothing at {path}"
+            raise LabelError(f"the data set {spec.name!r} is missing{where}", _FETCH if self.is_shipped else hint)
         return path
 
     @cached_property
@@ -303,6 +310,12 @@ class DatasetCollection:
                         "put each drive or clip into one split only",
                     )
         return chosen
+
+
+def data_folder(given: Path | None, default: Path = SHIPPED_DATA) -> Path:
+    """Returns the folder that data sets are in: the `given` one, else $LANESTREAM_DATA, else the `default`."""
+    named = given or os.environ.get("LANESTREAM_DATA")
+    return Path(named) if named else default
 
 
 def origin_of(collection: DatasetCollection | None, rendered_scenes: int) -> dict[str, Any]:

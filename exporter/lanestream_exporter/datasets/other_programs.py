@@ -33,7 +33,6 @@ _JSON: Final = (".json", ".jsonl")
 _PROGRAMS: Final[Mapping[str, _Program]] = {
     "COCO": _Program(_JSON, re.compile(rb'"category_id"|"supercategory"'), _IMPORT),
     "VIA (VGG Image Annotator)": _Program((*_JSON, ".csv"), re.compile(rb"shape_attributes"), _CONVERT),
-    "Label Studio": _Program(_JSON, re.compile(rb'"original_width"|"annotation_id"|"from_name"|"lead_time"'), _CONVERT),
     "Supervisely": _Program(_JSON, re.compile(rb'"geometryType"|"classTitle"'), _CONVERT),
     "Scalabel or BDD100K": _Program(_JSON, re.compile(rb'"poly2d"'), _CONVERT),
     "OpenLane": _Program(_JSON, re.compile(rb'"lane_lines"'), _CONVERT),

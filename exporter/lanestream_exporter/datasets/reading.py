@@ -17,6 +17,7 @@ from lanestream_exporter.datasets.entries import Box, LabelEntries, LabelEntry
 from lanestream_exporter.datasets.files import DataFolder, error_at
 from lanestream_exporter.datasets.formats import AUTO, FORMATS, format_of
 from lanestream_exporter.datasets.images import ImageReader
+from lanestream_exporter.datasets.label_map import BY_WORDS, LabelMap
 from lanestream_exporter.datasets.labels import (
     PARTIAL,
     Coverage,
@@ -26,7 +27,7 @@ from lanestream_exporter.datasets.labels import (
     checked_points,
     points_inside,
 )
-from lanestream_exporter.datasets.shapes import no_boundaries
+from lanestream_exporter.datasets.shapes import no_boundaries, unknown_label
 
 # The fields of a record that figures are given by.
 _CONDITIONS: Final = ("scene", "light", "wet", "markings")
@@ -43,45 +44,56 @@ class LabeledSample:
     image: Image
 
 
-def read_dataset(path: Path, format: str = AUTO) -> LabeledImages:  # noqa: A002
+def read_dataset(path: Path, format: str = AUTO, labels: LabelMap = BY_WORDS) -> LabeledImages:  # noqa: A002
     """Yields the labeled frames of the data set at `path`, a folder or a label file, with their images.
 
     Images are BGR (H, W, 3) uint8 and decoded one at a time. `frame.group` names the drive or clip. `format` is one of
-    `formats.FORMATS`, or "auto". Raises LabelError at the first unusable record, with its file and line.
+    `formats.FORMATS`, or "auto"; `labels` says what labels mean. Raises LabelError at the first unusable record, with
+    its file and line.
     """
-    for sample in scan_dataset(path, format):
+    for sample in scan_dataset(path, format, labels):
         if isinstance(sample, LabelError):
             raise sample
         yield sample.frame, sample.image
 
 
-def scan_dataset(path: Path, format: str = AUTO) -> Iterator[LabeledSample | LabelError]:  # noqa: A002
+def scan_dataset(
+    path: Path,
+    format: str = AUTO,  # noqa: A002
+    labels: LabelMap = BY_WORDS,
+) -> Iterator[LabeledSample | LabelError]:
     """Yields the samples of the data set at `path`, and every fault of an unusable record instead of raising it.
 
     Raises LabelError if there is no data set at `path`, or if its format can't be recognized.
     """
     with ImageReader() as images:
-        for entry in read_entries(path, format):
+        for entry in read_entries(path, format, labels):
             yield from [entry] if isinstance(entry, LabelError) else open_entry(entry, images)
 
 
-def read_entries(path: Path, format: str = AUTO) -> LabelEntries:  # noqa: A002
+def read_entries(path: Path, format: str = AUTO, labels: LabelMap = BY_WORDS) -> LabelEntries:  # noqa: A002
     """Yields the records of the data set at `path` without opening its images, and unusable ones as their errors.
 
-    A data set with shapes but without a single boundary is an error, which comes last. Raises LabelError if there is no
-    data set at `path`, or if its format can't be recognized.
+    A label of a line that means nothing is an error where it is used first. A data set with shapes but without a single
+    boundary is an error, which comes last. Raises LabelError if there is no data set at `path`, if its format can't be
+    recognized, or if `labels` are given for a format without any.
     """
     folder = DataFolder.at(path)
     name = format_of(folder, format)
     empty, without_lanes = True, True
     others: Counter[str] = Counter()
-    for entry in FORMATS[name].read(folder):
+    unknown: set[str] = set()
+    for entry in FORMATS[name].entries(folder, labels):
         empty = False
         if isinstance(entry, LabelError):
             without_lanes = False  # such a record may have some
         else:
-            without_lanes = without_lanes and not entry.lanes
+            without_lanes = without_lanes and not entry.lanes and not entry.unknown
             others.update(entry.others)
+            for label in entry.unknown:
+                if label not in unknown:
+                    unknown.add(label)
+                    yield unknown_label(entry.location, label)
         yield entry
     if empty:
         raise LabelError(f"no labeled frames of format {name} in {path}")

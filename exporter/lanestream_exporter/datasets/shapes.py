@@ -1,7 +1,7 @@
 """Shapes of drawing tools: which of them are boundaries, and how polygons and points become lines.
 
-Lines are boundaries, whatever their label. A shape of another tool is one if its label has a word for a boundary, such
-as lane, line, marking, kerb or dashed, and no word for something else on the road, such as area or stop.
+`label_map` says which labels mean boundaries. A line whose label means nothing is an error, because it may be one; such
+a shape of another tool is ignored.
 
 - A polygon along a marking becomes the line midway between its left and its right side. A polygon that only goes one
   way was meant as a line, and its points are taken as they are. A thick polygon is an area, which is refused.
@@ -13,52 +13,48 @@ as lane, line, marking, kerb or dashed, and no word for something else on the ro
 
 from __future__ import annotations
 
-import re
+import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 import numpy as np
 
-from lanestream.errors import LabelError
+from lanestream.errors import LabelError, one_line
 from lanestream.road.curve import FloatArray
-from lanestream_exporter.datasets.entries import is_boundary_type
+from lanestream_exporter.datasets.label_map import MEANINGS, LabelMap, Meaning
 from lanestream_exporter.datasets.labels import LabeledLane
 
 _HOW_TO_DRAW: Final = (
     "draw each boundary as a polyline or line strip; polygons along a marking and points are converted if their label "
-    "has a word like lane, line, marking or kerb"
+    "has a word like lane, line, marking or kerb, or if the label map names it"
 )
 
-_LINES: Final = frozenset({"polyline", "linestrip", "line"})
+_LINES: Final = frozenset({"polyline", "linestrip", "line", "vector"})
 _POINTS: Final = frozenset({"points", "point", "skeleton"})
 _POLYGON: Final = "polygon"
-_BOUNDARY_WORDS: Final = frozenset(
-    {"line", "lines", "marking", "markings", "boundary", "boundaries", "border", "divider", "separator"}
-)
-_BOUNDARY_START: Final = "lane"  # also of lanes, laneline and lanemarking
-_OTHER_WORDS: Final = frozenset(
-    {"area", "region", "drivable", "surface", "stop", "crosswalk", "crossing", "zebra", "arrow"}
-)
 _THICKEST: Final = 0.05  # of the image's width, on average over a polygon's length
 _SHARPEST_TURN: Final = 45.0  # degrees, of a polygon that was meant as a line
 _TRIANGLE_TURN: Final = 20.0  # degrees, of one with three corners, which may be the outline of a marking that tapers
+_LONGEST_LABEL: Final = 80  # characters in errors
 _LEAST_STEP: Final = 3.0  # pixels sideways that count as a change of direction
 
 
 @dataclass(frozen=True)
 class DrawnShape:
-    """A labeled shape: where it stands in its record, its tool, its label, and the boundary that it may be.
+    """A labeled shape: where it stands in its record, its tool, its label and what that means, and the boundary.
 
-    `lane` has the shape's points as they were drawn; they may be left out if it can't be a boundary. `group` is what
-    shapes of the same object share.
+    `meaning` is None for a line whose label means nothing. `lane` has the shape's points as they were drawn; they may
+    be left out if it is not a boundary. `group` is what shapes of the same object share.
     """
 
     where: str
     tool: str
     label: str
+    meaning: Meaning | None
     lane: LabeledLane
     group: object = None
 
@@ -70,11 +66,15 @@ class DrawnShape:
 
 @dataclass(frozen=True)
 class DrawnBoundaries:
-    """The boundaries among the shapes of a frame by where they stand, the tools of converted ones, and all others."""
+    """The boundaries among the shapes of a frame by where they stand, and the tools of converted ones.
+
+    `others` names the shapes that are not boundaries, and `unknown` has the labels of lines that may be.
+    """
 
     lanes: Mapping[str, LabeledLane]
     converted: tuple[str, ...]
     others: tuple[str, ...]
+    unknown: tuple[str, ...]
 
     @classmethod
     def of(cls, shapes: Iterable[DrawnShape], program: str, image_width: int | None) -> DrawnBoundaries:
@@ -85,12 +85,15 @@ class DrawnBoundaries:
         """
         lanes: dict[str, LabeledLane] = {}
         others: list[str] = []
+        unknown: list[str] = []
         parts: dict[object, list[DrawnShape]] = defaultdict(list)
         for shape in shapes:
-            if shape.tool in _LINES:
-                lanes[shape.where] = shape.lane
-            elif not names_boundary(shape.label):
+            if shape.meaning is None:
+                unknown.append(shape.label)
+            elif shape.meaning == "ignore":
                 others.append(shape.name)
+            elif shape.tool in _LINES:
+                lanes[shape.where] = shape.lane
             elif shape.tool in _POINTS or shape.tool == _POLYGON:
                 parts[_object_of(shape)].append(shape)
             else:
@@ -104,7 +107,8 @@ class DrawnBoundaries:
                 lanes[first.where] = replace(first.lane, points=_line_of(same, image_width))
             except ValueError as error:
                 raise LabelError(f"{first.where} {first.label!r}: {error}", _HOW_TO_DRAW) from None
-        return cls(lanes, tuple(shape.tool for same in parts.values() for shape in same), tuple(others))
+        converted = tuple(shape.tool for same in parts.values() for shape in same)
+        return cls(lanes, converted, tuple(others), tuple(unknown))
 
 
 def no_boundaries(path: Path, others: Counter[str]) -> LabelError:
@@ -113,21 +117,20 @@ def no_boundaries(path: Path, others: Counter[str]) -> LabelError:
     return LabelError(f"none of the shapes in {path} is taken for a lane boundary: {drawn}", _HOW_TO_DRAW)
 
 
-def may_be_boundary(tool: str, label: str) -> bool:
-    """Whether a shape is a boundary or has to be one, so that its points matter."""
-    return tool in _LINES or names_boundary(label)
+def unknown_label(location: str, label: str) -> LabelError:
+    """Returns the error of a line at `location` whose label means nothing."""
+    means, name = ", ".join(MEANINGS[:-1]), one_line(label, _LONGEST_LABEL)
+    return LabelError(
+        f"{location}: the label {name!r} of a line is not known",
+        f"say what it means, {means} or {MEANINGS[-1]}: with --label {quote(f'{name}=ignore')}, or with "
+        f"labels = {{ ignore = [{json.dumps(name, ensure_ascii=False)}] }} in the manifest; labels with a word like "
+        "lane, line or kerb are known",
+    )
 
 
-def words_of(label: str) -> list[str]:
-    """Returns the words of a label in lower case: solid and white of `solid_white` and of `SolidWhite`."""
-    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", label)]
-
-
-def names_boundary(label: str) -> bool:
-    """Whether a label names a lane boundary."""
-    words = words_of(label)
-    named = any(word.startswith(_BOUNDARY_START) or word in _BOUNDARY_WORDS or is_boundary_type(word) for word in words)
-    return named and _OTHER_WORDS.isdisjoint(words)
+def meaning_of(tool: str, label: str, labels: LabelMap) -> Meaning | None:
+    """Returns what a shape is; None for a line whose label means nothing. Other tools than lines draw such things."""
+    return labels.meaning_of_line(label) if tool in _LINES else labels.meaning(label) or "ignore"
 
 
 def center_line(outline: FloatArray, image_width: int | None = None) -> FloatArray:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
-import cv2
-import numpy as np
-
-from lanestream.errors import LabelError, SourceError
-from lanestream.road.view import Image
+from lanestream.errors import LabelError
+from lanestream_exporter.datasets.images import decoded_frames
 from lanestream_exporter.datasets.labels import LabeledImages
 from lanestream_exporter.datasets.manifest import DatasetCollection, LabeledClip
 from lanestream_exporter.datasets.splits import Split
@@ -243,20 +239,3 @@ def _track(methods: Sequence[Method], clip: LabeledClip) -> dict[str, ClipRun]:
                 run.tracked.append(FrameEvaluation(clip.labeled[index], found))
                 run.alone.append(method.detect(image, clip.labeled[index]))
     return runs
-
-
-def decoded_frames(video: Path, frames: range) -> Iterator[tuple[int, Image, float]]:
-    """Yields the frames of a clip with their index and their time in seconds."""
-    capture = cv2.VideoCapture(str(video))
-    if not capture.isOpened():
-        raise SourceError(f"{video} can't be read as a video", "give the path of a video file")
-    fps = capture.get(cv2.CAP_PROP_FPS) or 25.0
-    capture.set(cv2.CAP_PROP_POS_FRAMES, frames.start)
-    try:
-        for index in frames:
-            ok, image = capture.read()
-            if not ok:
-                return
-            yield index, np.asarray(image, dtype=np.uint8), index / fps
-    finally:
-        capture.release()

@@ -71,26 +71,23 @@ class Disagreement:
         one, other = (
             detector.detect(working, FrameContext(), self._infer) for detector in (self.candidates, self.regression)
         )
-        return any(_differ(mine, theirs) for mine, theirs in zip(_ego(one), _ego(other), strict=True))
+        pairs = zip(ego_boundaries(one), ego_boundaries(other), strict=True)
+        return any(_differ(mine, theirs, one.view) for mine, theirs in pairs)
 
     def _infer(self, role: ModelRole, inputs: NDArray[np.uint8]) -> NDArray[np.float32]:
         return self.classifier.run(inputs) if role == "classifier" else self.prior.infer(role, inputs)
 
 
-def _ego(found: Detections) -> tuple[_Found, _Found]:
+def ego_boundaries(found: Detections) -> tuple[Detection | None, Detection | None]:
     """Returns the nearest boundaries left and right of the middle of the lowest row."""
     view = found.view
     left: Sequence[Detection] = [each for each in found.boundaries if float(each.curve.x(view.bottom)) < view.middle]
     right = found.boundaries[len(left) :]
-    return (left[-1], view) if left else (None, view), (right[0], view) if right else (None, view)
+    return left[-1] if left else None, right[0] if right else None
 
 
-_Found = tuple[Detection | None, RoadView]
-
-
-def _differ(one: _Found, other: _Found) -> bool:
+def _differ(first: Detection | None, second: Detection | None, view: RoadView) -> bool:
     """Returns whether two detections of one side are different boundaries, or of different kinds."""
-    (first, view), (second, _) = one, other
     if first is None or second is None:
         return first is not second
     below = _COMPARED * view.depth

@@ -77,7 +77,8 @@ def test_the_tables_of_results_are_complete() -> None:
     ego = {name for name in EgoModel.model_fields if not name.endswith("_sigma")}
     assert set(rows("| field | | needs |")) == ego - {"left", "right", "left_kind", "right_kind"}
     what = rows("| field of a lane | |")
-    assert set(what) == {"kind", "kind_probability"} | {f"marking.{name}" for name in MarkingModel.model_fields}
+    lane = set(LaneModel.model_fields) - {"marking"}
+    assert set(what) == lane | {f"marking.{name}" for name in MarkingModel.model_fields}
     for name, values in (("kind", BoundaryKind), ("marking.type", MarkingType), ("marking.color", MarkingColor)):
         assert set(get_args(values)) <= set(re.findall(r"`(\w+)`", what[name][0]))
     assert {f"{name}_sigma" for name in rows("| field | | needs |")} <= set(EgoModel.model_fields)
@@ -89,6 +90,18 @@ def test_the_tables_of_results_are_complete() -> None:
         name: set(re.findall(r"`(\w+)`", fields)) for name, (fields, *_) in rows("| event | fields | |").items()
     }
     assert described == events
+
+
+def test_every_field_is_described() -> None:
+    fields = {
+        f"{name}.{field}": schema
+        for name, message in document()["components"]["schemas"].items()
+        for field, schema in message["properties"].items()
+    }
+    parts = {name: [schema, *schema.get("anyOf", [])] for name, schema in fields.items() if not name.endswith(".type")}
+    assert [
+        name for name, found in parts.items() if not any({"description", "$ref"} & set(each) for each in found)
+    ] == []
 
 
 def test_the_tables_of_warnings_and_departures_are_complete() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from lanestream.road.view import USUAL_LANE_WIDTH, Scaling
 from lanestream_exporter.datasets.horizons import drive_horizons
+from lanestream_exporter.datasets.images import decoded_frames
 from lanestream_exporter.datasets.labels import LabeledFrame
 from lanestream_exporter.datasets.manifest import DatasetCollection, LabeledClip
 from lanestream_exporter.datasets.splits import SPLITS
@@ -26,7 +27,6 @@ from lanestream_exporter.evaluation.boundaries import (
     match,
     match_ego,
 )
-from lanestream_exporter.evaluation.measuring import decoded_frames
 from lanestream_exporter.evaluation.tracking.answers import Answer
 from lanestream_exporter.evaluation.tracking.appearance import appearance_figures
 from lanestream_exporter.evaluation.tracking.comparison import (

@@ -152,15 +152,6 @@ _COCO = {
     "categories": [{"id": 1, "name": "lanes", "supercategory": "none"}],
 }
 _VIA = {"a.jpg1": {"filename": "a.jpg", "regions": [{"shape_attributes": {"name": "polyline", "all_points_x": [1]}}]}}
-_LABEL_STUDIO = [
-    {
-        "id": 1,
-        "data": {"image": "/data/a.jpg"},
-        "annotations": [
-            {"result": [{"original_width": WIDTH, "type": "polygonlabels", "value": {"polygonlabels": ["lanes"]}}]}
-        ],
-    }
-]
 _SUPERVISELY = {"size": {}, "objects": [{"geometryType": "line", "points": {"exterior": [[1, 2], [3, 4]]}}]}
 _SCALABEL = [{"name": "a.jpg", "labels": [{"category": "lane", "poly2d": [{"vertices": [[1, 2]]}]}]}]
 _VOC = "<annotation>\n<folder>x</folder><filename>a.jpg</filename>\n<object><name>lane</name></object></annotation>"
@@ -175,7 +166,6 @@ _LABELME_XML = (
         ("_annotations.coco.json", _COCO, "COCO"),
         ("via_project.json", _VIA, "VIA (VGG Image Annotator)"),
         ("via.csv", "filename,file_size,region_count,region_shape_attributes\n", "VIA (VGG Image Annotator)"),
-        ("export.json", _LABEL_STUDIO, "Label Studio"),
         ("ann/a.jpg.json", _SUPERVISELY, "Supervisely"),
         ("labels.json", _SCALABEL, "Scalabel or BDD100K"),
         ("a.xml", _VOC, "Pascal VOC (labelImg)"),

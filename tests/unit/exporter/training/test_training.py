@@ -173,6 +173,8 @@ def test_the_shipped_recipes_are_read() -> None:
     )
     assert [tuned.initial for tuned in fine] == ["shipped", "shipped"]
     assert fine[0].data.regressor == "shipped"
+    trial = read_config(Path("classifier-trial"), ClassifierConfig)
+    assert (trial.initial, trial.data.regressor, trial.data.manifest) == ("shipped", "shipped", None)
     toy = read_config(Path("classifier-toy"), ClassifierConfig)
     assert (toy.data.propagation_stride, toy.data.manifest) == (0, None)
     published = read_config(CONFIG_FOLDER / "classifier-published.toml", ClassifierConfig)
