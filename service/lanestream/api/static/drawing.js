@@ -15,6 +15,13 @@ const FORESHORTENING = 1.6;
 const CORE = 0.45;
 const TICKS = 12;
 const TICK_LENGTH = 6;
+// The opacity of the ego lane from its far end to its near one, where a hood may hide the road.
+const FILL = [
+  [0, 0],
+  [0.35, 0.18],
+  [0.78, 0.36],
+  [1, 0.06],
+];
 // A boundary that ends in this share of the picture at its side leaves it there.
 const SIDE = 0.01;
 const DARK = "rgba(12, 16, 20, 0.85)";
@@ -67,7 +74,7 @@ export function drawHorizon(context, fraction) {
 }
 
 /**
- * Fills the ego lane where both of its boundaries are reported, fading out with distance.
+ * Fills the ego lane where both of its boundaries are reported. The area fades out at both ends.
  * @param {CanvasRenderingContext2D} context
  * @param {LanesMessage} answer
  */
@@ -83,9 +90,7 @@ function fillEgoLane(context, answer) {
   const bottom = leavesLeft || leavesRight ? Math.max(leftY, rightY) : Math.min(leftY, rightY);
   if (Math.min(leftY, rightY) - top < 2) return;
   const fading = context.createLinearGradient(0, top, 0, bottom);
-  fading.addColorStop(0, `rgba(${EGO_LANE}, 0)`);
-  fading.addColorStop(0.35, `rgba(${EGO_LANE}, 0.16)`);
-  fading.addColorStop(1, `rgba(${EGO_LANE}, 0.36)`);
+  for (const [share, opacity] of FILL) fading.addColorStop(share, `rgba(${EGO_LANE}, ${opacity})`);
   context.globalAlpha = 1;
   context.fillStyle = fading;
   context.beginPath();
