@@ -47,6 +47,7 @@ from lanestream_client.frames import (
 )
 from lanestream_client.oversize import smaller_image
 from lanestream_client.requests import ServiceInfo
+from lanestream_client.tls import tls_context
 
 if TYPE_CHECKING:
     from lanestream_client.pixels import BgrImage
@@ -65,8 +66,11 @@ class AsyncLaneClient:
         *,
         api_key: str | None = None,
         reconnect_s: float = RetryPolicy.total_s,
+        ca_file: str | Path | None = None,
+        client_certificate: str | Path | None = None,
     ) -> None:
-        self._endpoints = deque(parse_endpoints(url, api_key))  # the replica that answered last comes first
+        tls = tls_context(ca_file, client_certificate)
+        self._endpoints = deque(parse_endpoints(url, api_key, tls))  # the replica that answered last comes first
         self._timeout = timeout
         self._in_flight = in_flight
         self._retry = RetryPolicy(reconnect_s)

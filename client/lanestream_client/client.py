@@ -41,6 +41,7 @@ from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
 from lanestream_client.frames import DetectedLanes, SourceFrame, StreamResult, StreamSummary, as_source_frames
 from lanestream_client.oversize import smaller_image
 from lanestream_client.requests import ServiceInfo
+from lanestream_client.tls import tls_context
 
 if TYPE_CHECKING:
     from lanestream_client.pixels import BgrImage
@@ -55,8 +56,11 @@ class LaneClient:
     `in_flight` frames unanswered: one gives the freshest results, a few hide a slow network. A stream that loses its
     connection reconnects to any replica, and ends after `reconnect_s` seconds without a connection; 0 disables this.
 
-    Raises SettingsError if a URL or `api_key` is not valid. The methods raise ConnectionFailedError if the service
-    can't be reached or is lost, and the errors that the service sends, as the classes of `lanestream.errors`.
+    For https, `ca_file` is a PEM file of the authorities to trust instead of the system's, and `client_certificate` one
+    with a certificate and its private key, for services that ask for it.
+
+    Raises SettingsError if a URL, `api_key` or a file is not valid. The methods raise ConnectionFailedError if the
+    service can't be reached or is lost, and the errors that the service sends, as the classes of `lanestream.errors`.
     """
 
     def __init__(
@@ -67,8 +71,11 @@ class LaneClient:
         *,
         api_key: str | None = None,
         reconnect_s: float = RetryPolicy.total_s,
+        ca_file: str | Path | None = None,
+        client_certificate: str | Path | None = None,
     ) -> None:
-        self._endpoints = deque(parse_endpoints(url, api_key))  # the replica that answered last comes first
+        tls = tls_context(ca_file, client_certificate)
+        self._endpoints = deque(parse_endpoints(url, api_key, tls))  # the replica that answered last comes first
         self._timeout = timeout
         self._in_flight = in_flight
         self._retry = RetryPolicy(reconnect_s)

@@ -53,7 +53,19 @@ def _service_options(command: Command) -> Command:
         multiple=True,
         help="URL of a service, such as http://127.0.0.1:8000; repeat it for replicas  [default: run in process]",
     )
-    return url(key(command))
+    ca_file = click.option(
+        "--ca-file",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="PEM file of the authorities whose certificates a service at https:// may have  [default: the system's]",
+    )
+    certificate = click.option(
+        "--client-certificate",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="PEM file with a certificate and its private key, for a service that asks for one.",
+    )
+    return url(key(ca_file(certificate(command))))
 
 
 _jsonl_option = click.option(
@@ -339,14 +351,18 @@ def _open_service(
     load_engine: LoadEngine,
     url: tuple[str, ...],
     api_key: str | None,
+    ca_file: Path | None,
+    client_certificate: Path | None,
     reconnect: float | None = None,
     **in_process: Any,
 ) -> Iterator[LaneService]:
     """Opens a client of the service at `url`, or of an engine in this process if `url` is empty."""
     if not url:
         key_was_given = click.get_current_context().get_parameter_source("api_key") is ParameterSource.COMMANDLINE
-        if key_was_given or reconnect is not None:
-            raise click.UsageError("--api-key and --reconnect need a service: add --url")
+        if key_was_given or any(option is not None for option in (ca_file, client_certificate, reconnect)):
+            raise click.UsageError(
+                "--api-key, --ca-file, --client-certificate and --reconnect need a service: add --url"
+            )
         yield InProcessClient(load_engine(in_process["model"], in_process["provider"], in_process["regressor"]))
         return
     if any(option is not None for option in in_process.values()):
@@ -354,7 +370,9 @@ def _open_service(
             "--model, --regressor and --provider configure the networks of this process and can't be used with --url"
         )
     reconnect_s = RetryPolicy.total_s if reconnect is None else reconnect
-    with LaneClient(url, api_key=api_key, reconnect_s=reconnect_s) as client:
+    with LaneClient(
+        url, api_key=api_key, reconnect_s=reconnect_s, ca_file=ca_file, client_certificate=client_certificate
+    ) as client:
         yield client
 
 

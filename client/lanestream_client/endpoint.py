@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.client import responses
+from ssl import SSLContext
 from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
@@ -34,6 +35,7 @@ from lanestream.errors import (
 from lanestream.protocol import SUBPROTOCOL
 from lanestream_client.proxies import Proxy, find_proxy
 from lanestream_client.redaction import redact_url, redact_urls
+from lanestream_client.tls import tls_hint
 
 # How long `ready` may take after a fast handshake: the service may first have to fetch the session from its store, or
 # to close the previous socket of the session.
@@ -69,8 +71,8 @@ Transport = TypeVar("Transport", httpx.BaseTransport, httpx.AsyncBaseTransport)
 class Endpoint:
     """The address of one replica: `base` for people, `http` for requests, `stream` for WebSockets.
 
-    `headers` are sent with each request and each handshake. Both go through `proxy`, unless it is None. Neither `base`
-    nor the representation holds a secret.
+    `headers` are sent with each request and each handshake. Both go through `proxy`, unless it is None, and use `tls`
+    for https, or the defaults. Neither `base` nor the representation holds a secret.
     """
 
     base: str
@@ -78,13 +80,14 @@ class Endpoint:
     stream: str = field(repr=False)
     headers: Mapping[str, str] = field(repr=False)
     proxy: Proxy | None = None
+    tls: SSLContext | None = None
 
     @classmethod
-    def parse(cls, url: str, api_key: str | None = None) -> Endpoint:
+    def parse(cls, url: str, api_key: str | None = None, tls: SSLContext | None = None) -> Endpoint:
         """Parses an http, https, ws or wss URL, with or without a path before `/v1`.
 
-        Raises SettingsError if the URL, the key or the environment's proxy for the URL is not valid, and
-        MissingExtraError if that proxy needs packages that are missing.
+        Raises SettingsError if the URL, the key or the environment's proxy for the URL is not valid, or if there is a
+        `tls` for a URL without TLS, and MissingExtraError if that proxy needs packages that are missing.
         """
         invalid = SettingsError(f"{redact_url(url)!r} is not a valid service URL", _URL_HINT)
         try:
@@ -96,12 +99,15 @@ class Endpoint:
             raise invalid
         address = parts.netloc + parts.path.removesuffix("/v1/stream").rstrip("/")
         http = f"{_HTTP_SCHEMES[parts.scheme]}://{address}"
+        if tls is not None and not http.startswith("https:"):
+            raise SettingsError(f"{redact_url(url)!r} does not use TLS, but a certificate is given", "use https://")
         return cls(
             base=redact_url(url),
             http=http,
             stream=f"{_WEBSOCKET_SCHEMES[parts.scheme]}://{address}/v1/stream",
             headers=_headers(api_key),
             proxy=find_proxy(http),
+            tls=tls,
         )
 
     @property
@@ -110,17 +116,20 @@ class Endpoint:
         return f"check the proxy, or add {urlsplit(self.http).hostname} to NO_PROXY to connect without it"
 
 
-def parse_endpoints(url: str | Sequence[str], api_key: str | None = None) -> tuple[Endpoint, ...]:
+def parse_endpoints(
+    url: str | Sequence[str], api_key: str | None = None, tls: SSLContext | None = None
+) -> tuple[Endpoint, ...]:
     """Parses the URL or URLs of a service's replicas. Raises SettingsError if one is not valid or none is given."""
     urls = [url] if isinstance(url, str) else url
     if not urls:
         raise SettingsError("no service URL was given", _URL_HINT)
-    return tuple(Endpoint.parse(each, api_key) for each in urls)
+    return tuple(Endpoint.parse(each, api_key, tls) for each in urls)
 
 
 def connect_options(endpoint: Endpoint, timeout: float) -> dict[str, Any]:
     """Returns the arguments for either of websockets' `connect` functions. `timeout` is in seconds."""
     return {
+        **({} if endpoint.tls is None else {"ssl": endpoint.tls}),
         "uri": endpoint.stream,
         "subprotocols": [Subprotocol(SUBPROTOCOL)],
         "proxy": None if endpoint.proxy is None else endpoint.proxy.url,
@@ -139,8 +148,10 @@ def connect_options(endpoint: Endpoint, timeout: float) -> dict[str, Any]:
 def http_options(endpoints: Sequence[Endpoint], transport: Callable[..., Transport]) -> dict[str, Any]:
     """Returns the arguments for either of httpx's clients that decide how to connect; `transport` is the class."""
     # With a transport of its own, a client does not read the variables for proxies.
-    proxied = {endpoint.http: transport(proxy=endpoint.proxy.url) for endpoint in endpoints if endpoint.proxy}
-    return {"transport": transport(), "mounts": proxied}
+    tls = endpoints[0].tls
+    verify: dict[str, Any] = {} if tls is None else {"verify": tls}
+    proxied = {endpoint.http: transport(proxy=endpoint.proxy.url, **verify) for endpoint in endpoints if endpoint.proxy}
+    return {"transport": transport(**verify), "mounts": proxied}
 
 
 @contextmanager
@@ -194,8 +205,15 @@ def _unreachable_error(endpoint: Endpoint, error: Exception) -> ConnectionFailed
     reason = "the connection timed out" if timed_out else redact_urls(re.sub(r"^\[Errno -?\d+\] ", "", str(error)))
     reason = one_line(reason) or type(error).__name__
     failure = f"can't reach the service at {endpoint.base}"
+    hint = tls_hint(error)
+    if hint is not None:
+        return ConnectionFailedError(f"{failure}: {reason}", hint)
     if endpoint.proxy is not None:
         return ConnectionFailedError(f"{failure} through {endpoint.proxy}: {reason}", endpoint.without_proxy)
+    if endpoint.http.startswith("https:") and not timed_out:
+        # With TLS 1.3 a server that misses the certificate of its client may just close the connection.
+        hint = "check that a service runs there, and whether it asks for a certificate (--client-certificate)"
+        return ConnectionFailedError(f"{failure}: {reason}", hint)
     return ConnectionFailedError(f"{failure}: {reason}", "start one with `lanestream serve`")
 
 
