@@ -43,6 +43,7 @@ NOT_RUN = [
     ("README.md", "python3 -m venv *", "`make test` does the same; tests/integration/test_wheel.py checks the package"),
     ("CONTRIBUTING.md", "make *", "checks the repository itself; CI runs both"),
     ("CONTRIBUTING.md", ".venv/bin/python -m pytest *", "is a part of the tests"),
+    ("docs/batch.md", "*", "tests/integration/test_batch.py"),
     ("docs/benchmarks.md", "make bench*", f"{LONG}; tests/integration/test_bench.py runs a part"),
     ("docs/benchmarks.md", "* -m bench.report", "reads what `make bench` wrote"),
     ("docs/cameras.md", "lanestream calibrate *", f"{LONG}; tests/unit/exporter/test_camera_calibration.py"),
@@ -62,7 +63,9 @@ NOT_RUN = [
     ("docs/deployment.md", "journalctl *", SYSTEM),
     ("docs/exporting.md", "lanestream export alexnet.pt *", "tests/unit/exporter/exporting/test_export_parts.py"),
     ("docs/index.md", "lanestream stream my_drive.mp4 *", "is the first command of the quick start"),
+    ("docs/javascript.md", "*", "tests/browser/test_js_client.py"),
     ("docs/kubernetes.md", "*", "needs a cluster and a registry; the tests of the chart are in tests/unit/deploy"),
+    ("docs/labeling.md", "lanestream *", "tests/integration/test_label_command.py"),
     ("docs/operations.md", "curl -X POST *", "needs a service with keys; tests/integration/test_access.py"),
     ("docs/operations.md", "new WebSocket(*", "one line of a web page; tests/integration/test_access.py"),
     ("docs/protocol.md", "new WebSocket(*", "one line of a web page; tests/integration/test_access.py"),
@@ -85,7 +88,7 @@ PRINTED = {
     "import { readFile }*": "type: 'lanes'",
 }
 # Blocks in these languages are data or belong to other programs.
-NOT_CODE = {"json", "nginx", "text", "toml", "yaml"}
+NOT_CODE = {"html", "json", "nginx", "text", "toml", "yaml"}
 # Commands that are safe to run. Others must be listed above.
 SAFE = {"curl", "head", "lanestream", "make"}
 # With Node 20 `WebSocket` is an option.

@@ -25,6 +25,9 @@ export interface StartMessage {
    * The token of `ready` or `draining` of the session to resume.
    */
   resume_token?: string | null;
+  /**
+   * `latest`: a newer frame replaces a waiting one; `all`: every frame is answered.
+   */
   mode?: "latest" | "all";
   /**
    * The detector that finds the lanes; the service's default if missing.
@@ -119,6 +122,9 @@ export interface DepartureOptions {
  */
 export interface FrameMessage {
   type?: "frame";
+  /**
+   * Number of the frame; the previous one plus one if missing.
+   */
   seq?: number | null;
   /**
    * Capture time in seconds, on any clock that does not run backwards.
@@ -144,6 +150,9 @@ export interface EndMessage {
  */
 export interface ReadyMessage {
   type: "ready";
+  /**
+   * Name of the session in the service's logs.
+   */
   session: string;
   /**
    * Resumes this session; keep it as secret as an API key.
@@ -153,10 +162,25 @@ export interface ReadyMessage {
    * Whether an earlier session continues; false for a new one.
    */
   resumed: boolean;
+  /**
+   * Number of the last answered frame of a resumed session.
+   */
   last_seq: number | null;
+  /**
+   * The mode of the stream.
+   */
   mode: "latest" | "all";
+  /**
+   * The detector that finds the lanes.
+   */
   detector: string;
+  /**
+   * Name and version of its network.
+   */
   model: string;
+  /**
+   * The execution provider that runs its network.
+   */
   provider: string;
   limits: Limits;
 }
@@ -202,11 +226,29 @@ export interface Limits {
  */
 export interface LanesMessage {
   type: "lanes";
+  /**
+   * Number of the frame.
+   */
   seq: number;
+  /**
+   * Capture time of the frame in seconds.
+   */
   timestamp: number;
+  /**
+   * Width of the image in pixels.
+   */
   width: number;
+  /**
+   * Height of the image in pixels.
+   */
   height: number;
+  /**
+   * Row of the horizon in this frame in pixels.
+   */
   horizon: number;
+  /**
+   * The reported boundaries.
+   */
   lanes: LaneModel[];
   ego: EgoModel;
   /**
@@ -233,6 +275,9 @@ export interface LanesMessage {
  * The curve is valid between the rows of `line`. On a flat road it is a parabola on the ground, seen in perspective.
  */
 export interface LaneModel {
+  /**
+   * Identity of the boundary, which it keeps while it is tracked.
+   */
   track_id: number;
   /**
    * -1 is ego left, +1 ego right, -2 and +2 are the next boundaries outwards.
@@ -242,6 +287,9 @@ export interface LaneModel {
    * `detected` in this frame, `inferred` from the road where little or no paint was seen, or `predicted` only.
    */
   state: "detected" | "inferred" | "predicted";
+  /**
+   * Probability that it is a boundary.
+   */
   probability: number;
   /**
    * A `marking` on the road, or a `road_edge`: a curb, or where the pavement ends.
@@ -256,20 +304,28 @@ export interface LaneModel {
    */
   marking: MarkingModel | null;
   /**
-   * Points on the curve, from the lowest row to the highest.
+   * Points [x, y] on the curve in pixels, from the lowest row to the highest.
    */
   points: [number, number][];
   line: LineModel;
+  /**
+   * Row of the horizon of the curve in pixels.
+   */
   horizon: number;
   /**
+   * [v, b, k] of the curve: v in pixels, b in pixels per row, k in square pixels.
+   *
    * @minItems 3
    * @maxItems 3
    */
   coefficients: [number, number, number];
   /**
-   * 3 x 3 covariance of the coefficients.
+   * 3 x 3 covariance of the coefficients, in their units.
    */
   covariance: number[][];
+  /**
+   * Seconds since its track began.
+   */
   age_s: number;
   /**
    * [a, b, c] of Y = a X^2 + b X + c on the road, in meters: X forward of the camera, Y left of the vehicle's middle. Null without a camera.
@@ -288,11 +344,17 @@ export interface MarkingModel {
    * The most probable type; `dots` are raised dots.
    */
   type: "solid" | "dashed" | "double" | "dots";
+  /**
+   * Probability of this type.
+   */
   type_probability: number;
   /**
    * The more probable color.
    */
   color: "white" | "yellow";
+  /**
+   * Probability of this color.
+   */
   color_probability: number;
   /**
    * Probability that type and color are both right.
@@ -300,15 +362,19 @@ export interface MarkingModel {
   probability: number;
 }
 /**
- * The end points of a boundary: a straight line would join its lowest and its highest row.
+ * The end points of the curve.
  */
 export interface LineModel {
   /**
+   * The point in the lowest row.
+   *
    * @minItems 2
    * @maxItems 2
    */
   bottom: [number, number];
   /**
+   * The point in the highest row.
+   *
    * @minItems 2
    * @maxItems 2
    */
@@ -322,7 +388,13 @@ export interface LineModel {
  * are known, `heading` and `curvature` if at least one is. Each has its standard deviation in `..._sigma`.
  */
 export interface EgoModel {
+  /**
+   * Track id of the left boundary; null without one.
+   */
   left: number | null;
+  /**
+   * Track id of the right boundary; null without one.
+   */
   right: number | null;
   /**
    * Kind of the left boundary; null without one.
@@ -332,32 +404,53 @@ export interface EgoModel {
    * Kind of the right boundary; null without one.
    */
   right_kind: ("marking" | "road_edge") | null;
+  /**
+   * Distance of the camera from the center of the lane as a share of its width, positive to the right.
+   */
   offset: number | null;
+  /**
+   * Standard deviation of `offset`.
+   */
   offset_sigma: number | null;
   /**
    * Offset in meters, positive to the right of the center.
    */
   offset_m: number | null;
+  /**
+   * Standard deviation of `offset_m` in meters.
+   */
   offset_m_sigma: number | null;
   /**
    * Lane width in meters.
    */
   lane_width_m: number | null;
+  /**
+   * Standard deviation of `lane_width_m` in meters.
+   */
   lane_width_m_sigma: number | null;
   /**
    * Angle from the vehicle's heading to the lane's in radians, positive to the left.
    */
   heading: number | null;
+  /**
+   * Standard deviation of `heading` in radians.
+   */
   heading_sigma: number | null;
   /**
    * Curvature of the lane in 1/m, positive if it curves to the left.
    */
   curvature: number | null;
+  /**
+   * Standard deviation of `curvature` in 1/m.
+   */
   curvature_sigma: number | null;
   /**
    * Speed of the vehicle across its lane in m/s, positive to the right.
    */
   lateral_speed: number | null;
+  /**
+   * Standard deviation of `lateral_speed` in m/s.
+   */
   lateral_speed_sigma: number | null;
 }
 /**
@@ -382,14 +475,20 @@ export interface DepartureModel {
  */
 export interface CalibrationModel {
   /**
-   * Pitch of the camera, positive if it looks down.
+   * Pitch of the camera in degrees, positive if it looks down.
    */
   pitch: number;
+  /**
+   * Standard deviation of the pitch in degrees.
+   */
   pitch_sigma: number;
   /**
-   * Yaw of the camera, positive if it looks to the left.
+   * Yaw of the camera in degrees, positive if it looks to the left.
    */
   yaw: number;
+  /**
+   * Standard deviation of the yaw in degrees.
+   */
   yaw_sigma: number;
   /**
    * Whether the estimate is good enough to be used.
@@ -401,7 +500,13 @@ export interface CalibrationModel {
  */
 export interface LaneChangeModel {
   type: "lane_change";
+  /**
+   * Track id of the boundary.
+   */
   track_id: number;
+  /**
+   * The side to which the vehicle changes.
+   */
   direction: "left" | "right";
   /**
    * Time of the crossing, interpolated between frames.
@@ -413,8 +518,17 @@ export interface LaneChangeModel {
  */
 export interface DepartureEventModel {
   type: "departure";
+  /**
+   * What began: a warning, or a crossing.
+   */
   state: "warning" | "crossed";
+  /**
+   * The side of the boundary.
+   */
   side: "left" | "right";
+  /**
+   * Track id of the boundary.
+   */
   track_id: number;
   /**
    * Time of the warning or the crossing, interpolated between frames.
@@ -426,6 +540,9 @@ export interface DepartureEventModel {
  */
 export interface SceneCutModel {
   type: "scene_cut";
+  /**
+   * Time of the first frame of the new scene.
+   */
   timestamp: number;
 }
 /**
@@ -433,8 +550,17 @@ export interface SceneCutModel {
  */
 export interface CalibrationChangedModel {
   type: "calibration_changed";
+  /**
+   * The new pitch in degrees, positive if the camera looks down.
+   */
   pitch: number;
+  /**
+   * The new yaw in degrees, positive if the camera looks to the left.
+   */
   yaw: number;
+  /**
+   * Time of the frame in which it was noticed.
+   */
   timestamp: number;
 }
 /**
@@ -475,8 +601,17 @@ export interface TimingModel {
  */
 export interface WarningMessage {
   type: "warning";
+  /**
+   * The kind of warning, for programs.
+   */
   code: "timestamps_in_milliseconds" | "timestamps_not_advancing";
+  /**
+   * What is probably wrong, for people.
+   */
   message: string;
+  /**
+   * What to do, for people.
+   */
   hint: string;
   /**
    * The frame that showed it.
@@ -488,10 +623,25 @@ export interface WarningMessage {
  */
 export interface ErrorMessage {
   type: "error";
+  /**
+   * The kind of error, for programs; never changes its meaning.
+   */
   code: string;
+  /**
+   * What is wrong, for people.
+   */
   message: string;
+  /**
+   * What to do, for people.
+   */
   hint: string;
+  /**
+   * The frame that the error answers; null if none.
+   */
   seq: number | null;
+  /**
+   * Whether the service closes the stream.
+   */
   fatal: boolean;
 }
 /**
@@ -517,10 +667,25 @@ export interface DrainingMessage {
  */
 export interface SummaryMessage {
   type: "summary";
+  /**
+   * Frames received.
+   */
   frames: number;
+  /**
+   * Frames answered with lanes.
+   */
   answered: number;
+  /**
+   * Frames answered with an error.
+   */
   failed: number;
+  /**
+   * Frames without an answer, because newer ones replaced them.
+   */
   dropped: number;
+  /**
+   * Seconds since the socket was opened.
+   */
   duration_s: number;
 }
 /**
