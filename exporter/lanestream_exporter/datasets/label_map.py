@@ -26,7 +26,7 @@ _BOUNDARY_WORDS: Final = frozenset(
     | {"centerline", "centreline", "edgeline", "roadline"}
 )
 _BOUNDARY_START: Final = "lane"  # also of lanes, laneline and lanemarking
-# Words of what is not a boundary, even if the label has a word like lane or line.
+# Words that rule out a boundary, even beside a word like lane or line.
 _OTHER_WORDS: Final = frozenset(
     {"area", "region", "drivable", "surface", "stop", "crosswalk", "crosswalks", "crossing", "zebra", "arrow", "arrows"}
     | {"stopline", "ignore", "ignored", "horizon", "hood", "bonnet"}

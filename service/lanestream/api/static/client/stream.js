@@ -256,7 +256,7 @@ export class LaneStream extends Emitter {
         }
         return outcomes.length > 0;
     }
-    /** Returns the seconds until the next attempt, or null if the stream should give up. A restart is no failure. */
+    /** Returns the seconds until the next attempt, or null if the stream should give up. A restart is not a failure. */
     #pauseAfter(failure) {
         if (this.#closed) {
             return null;
