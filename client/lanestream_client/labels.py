@@ -76,7 +76,7 @@ def _nearest(lanes: Sequence[LaneModel], count: int) -> list[LaneModel]:
 
 
 def _legend_text(drawing: Drawing, lane: LaneModel, room: float) -> str:
-    """Returns what a boundary is, or only its position if there is no room for more."""
+    """Returns what a boundary is, or only its position if the rest does not fit."""
     position = position_name(lane.position)
     parts = [position, line_name(lane), "" if lane.state == "detected" else lane.state]
     return _first_that_fits(drawing, room, _ENTRY, ", ".join(part for part in parts if part), position)

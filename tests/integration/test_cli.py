@@ -171,7 +171,7 @@ def test_a_preview_is_shown_beside_other_outputs(
     assert Path("a.mp4").stat().st_size > 0
 
 
-@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="xdg-open is of Linux")
+@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="xdg-open opens pages on Linux only")
 def test_a_preview_is_opened_where_there_is_a_display(
     run: Run, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -150,7 +150,7 @@ def batch(
 def _run(
     job: BatchJob, gpx: Path | None, state: BatchState, executor: Executor, files: list[SourceFile], retry_failed: bool
 ) -> dict[str, str]:
-    """Processes what is not done yet, and reports it. Returns the errors of all files that failed, by path."""
+    """Processes and reports the files that remain. Returns the errors of all files that failed, by path."""
     info = executor.start()
     if info is None:
         return {}

@@ -70,7 +70,7 @@ class Tracks:
         """Returns the track of a video, and the time of its first frame on the track's clock.
 
         The track of the same name is taken, else one that covers the video's time. Without a creation time, a video
-        begins with the track of its name. Raises SourceError if there is no such track.
+        begins with the track of its name. Raises SourceError if no track fits.
         """
         named = next((path for path in self.spans if _stem(path) == _stem(video)), None)
         start = None if time.created is None else time.created + self.offset_s

@@ -31,8 +31,8 @@ _CONNECT_S: Final = 10.0
 class RayCluster:
     """Processes units on the cluster at `address`, in at most so many processes; None: one for each of its processors.
 
-    As a context manager it connects to the cluster and disconnects, which ends its actors. Raises BatchError if there
-    is no cluster, and MissingExtraError without Ray.
+    As a context manager it connects to the cluster and disconnects, which ends its actors. Raises BatchError if it
+    can't reach a cluster, and MissingExtraError without Ray.
     """
 
     def __init__(self, job: BatchJob, address: str, processes: int | None, stop: StopSignals) -> None:
