@@ -15,8 +15,10 @@ from lanestream.settings import Settings
 
 ROOT: Final = Path(__file__).parents[1]
 CHART: Final = ROOT / "deploy/helm/lanestream"
-# The chart itself sets the port and the paths, and takes secrets from Secrets.
-MANAGED_SETTINGS: Final = frozenset({"config", "port", "api_keys", "api_keys_file", "token_secret", "redis_url"})
+# The chart itself sets the port and the paths, and takes secrets from Secrets. The ingress adds TLS.
+MANAGED_SETTINGS: Final = frozenset(
+    {"config", "port", "tls_certificate", "tls_key", "api_keys", "api_keys_file", "token_secret", "redis_url"}
+)
 
 
 def generated_files() -> dict[Path, str]:

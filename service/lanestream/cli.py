@@ -159,6 +159,8 @@ def cli(context: click.Context) -> None:
 @click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="Execution provider  [default: auto]")
 @click.option("--max-sessions", type=click.IntRange(1), help="Maximum number of concurrent streams  [default: 64]")
 @click.option("--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 per line.")
+@click.option("--tls-certificate", type=click.Path(path_type=Path), help="PEM file of the certificate for https.")
+@click.option("--tls-key", type=click.Path(path_type=Path), help="PEM file of its private key, if it is another file.")
 @click.option("--log-format", type=click.Choice(["text", "json"]), help="Log format  [default: text]")
 @click.option(
     "--log-level", type=click.Choice(["debug", "info", "warning", "error"]), help="Log level  [default: info]"

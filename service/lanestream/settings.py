@@ -111,6 +111,12 @@ class Settings(BaseSettings):
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 selects a free one.")
+    tls_certificate: Path | None = Field(
+        default=None, description="PEM file with the certificate for https and its chain; without it, http is spoken."
+    )
+    tls_key: Path | None = Field(
+        default=None, description="PEM file with the private key of the certificate, if it is not in the same file."
+    )
     model: Path | None = Field(default=None, description="ONNX file of the network, or `shipped`, the default.")
     regressor: Path | None = Field(
         default=None, description="ONNX file of the regressor, `shipped`, the default, or `none`."
@@ -368,6 +374,8 @@ def load_settings(**options: object) -> Settings:
         else:
             label = _PREFIX + name.upper()
         raise _settings_error(label, problem) from None
+    if settings.tls_key is not None and settings.tls_certificate is None:
+        raise SettingsError("tls_key is set and tls_certificate is not", "set both, or neither")
     least = 4 * settings.max_bytes
     if settings.buffered_bytes < least:
         raise SettingsError(

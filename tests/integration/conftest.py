@@ -1,41 +1,21 @@
-"""Real servers on real sockets, in this process, each in its own thread."""
+"""Servers, networks and frames that several tests use."""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 
 import cv2
 import fakes
 import numpy as np
 import pytest
+from servers import serving
 
-from lanestream.api import create_app
-from lanestream.api.server import LanestreamServer, listen
 from lanestream.engine import Engine, load_engine
 from lanestream.settings import Settings
-from lanestream_client.overlays import draw_lanes
 from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
 Serve = Callable[..., str]
-
-
-@contextmanager
-def serving(engine: Engine | None, settings: Settings) -> Iterator[str]:
-    """Runs a server around `engine` and yields its URL."""
-    app = create_app(engine, settings, draw_lanes)
-    listener = listen("127.0.0.1", 0)
-    server = LanestreamServer(app, settings)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    thread.start()
-    try:
-        yield url
-    finally:
-        server.should_exit = True
-        thread.join(fakes.WAIT_S)
-        assert not thread.is_alive()
 
 
 @pytest.fixture

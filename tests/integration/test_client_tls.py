@@ -6,6 +6,7 @@ import asyncio
 import ssl
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ import fakes
 import pytest
 import trustme
 import uvicorn
+from servers import serving
 
 from lanestream.api import create_app
 from lanestream.api.server import listen
@@ -25,16 +27,25 @@ from lanestream_client import AsyncLaneClient, LaneClient
 
 
 @contextmanager
-def serving_tls(authority: trustme.CA, name: str, clients: trustme.CA | None = None) -> Iterator[str]:
-    """Runs a service with a certificate for `name`, and yields its URL. With `clients`, they need a certificate."""
+def serving_tls(authority: trustme.CA, name: str) -> Iterator[str]:
+    """Runs a service with a certificate for `name`, and yields its URL."""
+    with tempfile.TemporaryDirectory() as folder:
+        certificate = Path(folder) / "certificate.pem"
+        authority.issue_cert(name).private_key_and_cert_chain_pem.write_to_path(str(certificate))
+        with serving(fakes.engine(), Settings(tls_certificate=certificate)) as url:
+            yield url
+
+
+@contextmanager
+def asking_for_certificates(authority: trustme.CA, clients: trustme.CA) -> Iterator[str]:
+    """Runs a service whose clients need a certificate, as a proxy may demand it, and yields its URL."""
     listener = listen("127.0.0.1", 0)
     config = uvicorn.Config(create_app(fakes.engine(), Settings()), log_config=None)
     config.load()
     config.ssl = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    authority.issue_cert(name).configure_cert(config.ssl)
-    if clients is not None:
-        clients.configure_trust(config.ssl)
-        config.ssl.verify_mode = ssl.CERT_REQUIRED
+    authority.issue_cert("127.0.0.1").configure_cert(config.ssl)
+    clients.configure_trust(config.ssl)
+    config.ssl.verify_mode = ssl.CERT_REQUIRED
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
@@ -106,24 +117,16 @@ def test_a_certificate_of_another_host_is_named_as_the_reason(authority: trustme
         assert failure(url, ca_file=ca_file).hint == "use a host name or address that is in the service's certificate"
 
 
-def test_https_to_a_port_without_tls_is_named_as_the_reason(ca_file: Path) -> None:
-    listener = listen("127.0.0.1", 0)
-    config = uvicorn.Config(create_app(fakes.engine(), Settings()), log_config=None)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    try:
-        assert "http:// instead of https://" in failure(f"https://127.0.0.1:{listener.getsockname()[1]}").hint
-    finally:
-        server.should_exit = True
-        thread.join(fakes.WAIT_S)
+def test_https_to_a_port_without_tls_is_named_as_the_reason() -> None:
+    with serving(fakes.engine(), Settings()) as url:
+        assert "http:// instead of https://" in failure(url.replace("http", "https")).hint
 
 
 def test_a_service_may_ask_for_a_certificate(authority: trustme.CA, ca_file: Path, tmp_path: Path) -> None:
     clients = trustme.CA()
     certificate = tmp_path / "camera.pem"
     clients.issue_cert("camera-7").private_key_and_cert_chain_pem.write_to_path(str(certificate))
-    with serving_tls(authority, "127.0.0.1", clients) as url:
+    with asking_for_certificates(authority, clients) as url:
         with LaneClient(url, ca_file=ca_file, client_certificate=certificate) as client:
             assert client.detect(fakes.image_file()).width > 0
             assert len(list(client.stream([fakes.image_file()], mode="all"))) == 1

@@ -9,7 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import fakes
 import pytest
+import trustme
 
 SCRIPT = Path(__file__).parents[2] / "docker/healthcheck.py"
 
@@ -22,6 +24,14 @@ def check(**environment: str) -> subprocess.CompletedProcess[str]:
 def test_a_ready_service_is_healthy_and_no_proxy_is_used(url: str, host: str) -> None:
     port = str(urlsplit(url).port)
     result = check(LANESTREAM_HOST=host, LANESTREAM_PORT=port, http_proxy="http://127.0.0.1:9")
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_a_service_with_a_certificate_is_asked_over_https(serve: Callable[..., str], tmp_path: Path) -> None:
+    certificate = tmp_path / "certificate.pem"
+    trustme.CA().issue_cert("lanes.example.com").private_key_and_cert_chain_pem.write_to_path(str(certificate))
+    url = serve(fakes.engine(), tls_certificate=certificate)
+    result = check(LANESTREAM_PORT=str(urlsplit(url).port), LANESTREAM_TLS_CERTIFICATE=str(certificate))
     assert (result.returncode, result.stderr) == (0, "")
 
 

@@ -11,11 +11,12 @@ import asyncio
 import ipaddress
 import logging
 import time
-from collections import Counter, defaultdict, deque
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+from lanestream.api.turns import Turns
 from lanestream.streaming.token_bucket import TokenBucket, TokenBuckets
 
 if TYPE_CHECKING:
@@ -26,12 +27,15 @@ _log = logging.getLogger(__name__)
 # The key of a connection in the state of an ASGI scope.
 STATE_KEY: Final = "lanestream.connection"
 
-CutReason = Literal["address_limit", "limit", "full", "head", "body", "send", "pipeline", "message_size", "memory"]
+CutReason = Literal[
+    "address_limit", "limit", "full", "tls", "head", "body", "send", "pipeline", "message_size", "memory"
+]
 CUT_REASONS: Final[tuple[CutReason, ...]] = get_args(CutReason)
 _MEANINGS: Final[dict[CutReason, str]] = {
     "address_limit": "its address has too many connections, and this was the oldest without a session",
     "limit": "there are too many connections, and this was the oldest without a session",
     "full": "there are too many connections, and every other one has a session",
+    "tls": "TLS failed",
     "head": "the head of its request was too long, or took too long",
     "body": "the body of its request took too long",
     "send": "it did not read what it was sent",
@@ -50,6 +54,10 @@ _LOG_EVERY_S: Final = 10.0
 # Requests of one address, on average and as a burst. Most take less than a millisecond of the event loop.
 _REQUESTS_PER_S: Final = 500.0
 _REQUEST_BURST_S: Final = 1.0
+# TLS handshakes of one address, on average and as a burst. Most take a millisecond of the event loop, with RSA keys of
+# 4096 bits several.
+_HANDSHAKES_PER_S: Final = 100.0
+_HANDSHAKE_BURST_S: Final = 1.0
 # The rate of messages of all connections of a caller, as a multiple of that of one connection.
 _CALLER_RATE: Final = 8.0
 _MESSAGE_BURST_S: Final = 2.0
@@ -60,10 +68,10 @@ _NO_ADDRESS: Final = "local"
 class ConnectionLimits:
     """How many connections there may be and how long their peers may take, in seconds.
 
-    `without_session` and `per_address` are parts of `connections`. The head of a request must be complete within
-    `head_s`, its body within `body_s`; a peer must take a part of what it is sent within `send_s`, and an idle
-    connection is closed after `keep_alive_s`. `messages_per_s` is the rate at which the pings, pongs and fragments of a
-    WebSocket are read; a message counts as four of them.
+    `without_session` and `per_address` are parts of `connections`. A TLS handshake and the head of a request must be
+    complete within `head_s` each, the body of a request within `body_s`; a peer must take a part of what it is sent
+    within `send_s`, and an idle connection is closed after `keep_alive_s`. `messages_per_s` is the rate at which the
+    pings, pongs and fragments of a WebSocket are read; a message counts as four of them.
     """
 
     connections: int
@@ -97,8 +105,8 @@ class ConnectionTable:
         self._is_proxy = is_proxy
         self._observe = observe
         self._clock = clock
-        self._requests = TokenBuckets(_REQUESTS_PER_S, _REQUEST_BURST_S)
-        self._turns: dict[str, deque[Callable[[], None]]] = {}
+        self._requests = Turns(_REQUESTS_PER_S, _REQUEST_BURST_S, clock)
+        self._handshakes = Turns(_HANDSHAKES_PER_S, _HANDSHAKE_BURST_S, clock)
         self._messages = TokenBuckets(_CALLER_RATE * limits.messages_per_s, _MESSAGE_BURST_S)
         # Connections without a session by address, each time the oldest first; a dict is an ordered set.
         self._evictable: defaultdict[str, dict[Connection, None]] = defaultdict(dict)
@@ -124,38 +132,26 @@ class ConnectionTable:
                 per_address=min(self.limits.per_address, most),
             )
 
-    def admit(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> Connection:
-        """Returns the connection of a transport, which is closed already if every other one has a session."""
-        peer = transport.get_extra_info("peername")
-        address = _network(str(peer[0])) if isinstance(peer, tuple) else _NO_ADDRESS
-        connection = Connection(transport, address, self, loop)
+    def admit(self, connection: Connection) -> None:
+        """Takes a new connection into the table, or closes it if every other one has a session."""
+        address = connection.address
         if self._make_room(address):
             self._evictable[address][connection] = None
             self._count[address] += 1
         else:
             connection.cut("full")
-        return connection
 
     def begin_request(self, address: str, proceed: Callable[[], None]) -> bool:
-        """Returns whether a request of an address may begin now. If not, `proceed` is called as soon as it may.
+        """Returns whether a request of an address may begin now. If not, `proceed` is called as soon as it may."""
+        return self._is_proxy(address) or self._requests.begin(address, proceed)
 
-        The connections of an address take turns, so that one that sends as fast as it can does not keep others waiting.
-        """
-        if self._is_proxy(address):
-            return True
-        bucket = self._requests.bucket(address, self._clock())
-        if address not in self._turns and bucket.covers(1.0, self._clock()):
-            bucket.spend(1.0)
-            return True
-        if address not in self._turns:
-            self._turns[address] = deque()
-            self._schedule_turn(address)
-        self._turns[address].append(proceed)
-        return False
+    def begin_handshake(self, address: str, proceed: Callable[[], None]) -> bool:
+        """Returns whether a TLS handshake of an address may begin now. See `begin_request`."""
+        return self._is_proxy(address) or self._handshakes.begin(address, proceed)
 
     def count_request(self, address: str) -> None:
         """Counts a request that has begun without `begin_request`, behind the body of another one."""
-        self._requests.bucket(address, self._clock()).spend(1.0)
+        self._requests.count(address)
 
     def message_bucket(self) -> TokenBucket:
         """Returns the bucket of a new WebSocket, see `ConnectionLimits.messages_per_s`."""
@@ -195,7 +191,7 @@ class ConnectionTable:
         for connection in [*self._with_session, *(each for group in self._evictable.values() for each in group)]:
             connection.abort()
 
-    def report(self, reason: CutReason, address: str) -> None:
+    def report(self, reason: CutReason, address: str, detail: str = "") -> None:
         """Counts and logs that a connection was cut."""
         now = self._clock()
         self._observe(reason)
@@ -205,22 +201,12 @@ class ConnectionTable:
         self._next_log[reason] = now + _LOG_EVERY_S
         more = self._unlogged.pop(reason, 0)
         _log.warning(
-            "closed a connection from %s: %s%s", address, _MEANINGS[reason], f" ({more} more before)" if more else ""
+            "closed a connection from %s: %s%s%s",
+            address,
+            _MEANINGS[reason],
+            detail and f": {detail}",
+            f" ({more} more before)" if more else "",
         )
-
-    def _schedule_turn(self, address: str) -> None:
-        wait_s = self._requests.bucket(address, self._clock()).seconds_until(1.0, self._clock())
-        asyncio.get_running_loop().call_later(wait_s, self._next_turn, address)
-
-    def _next_turn(self, address: str) -> None:
-        turns, bucket = self._turns[address], self._requests.bucket(address, self._clock())
-        while turns and bucket.covers(1.0, self._clock()):
-            bucket.spend(1.0)
-            turns.popleft()()
-        if turns:
-            self._schedule_turn(address)
-        else:
-            del self._turns[address]
 
     def _make_room(self, address: str) -> bool:
         """Closes a connection if there are too many for another one. Returns False if none may be closed."""
@@ -268,12 +254,11 @@ class Connection(asyncio.Transport):
     What the peer makes the service do is charged to its `account`: its address, and once it is known the caller.
     """
 
-    def __init__(
-        self, transport: asyncio.Transport, address: str, table: ConnectionTable, loop: asyncio.AbstractEventLoop
-    ) -> None:
+    def __init__(self, transport: asyncio.Transport, table: ConnectionTable, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()
-        self.address = address
-        self.account = address
+        peer = transport.get_extra_info("peername")
+        self.address = _network(str(peer[0])) if isinstance(peer, tuple) else _NO_ADDRESS
+        self.account = self.address
         self.table = table
         self._transport = transport
         self._loop = loop

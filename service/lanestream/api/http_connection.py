@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from lanestream.api.connections import STATE_KEY
+from lanestream.api.connections import STATE_KEY, Connection
 from lanestream.api.problems import raw_response
 
 if TYPE_CHECKING:
-    from lanestream.api.connections import Connection, ConnectionTable, CutReason
+    from lanestream.api.connections import ConnectionTable, CutReason
 
     # uvicorn does not annotate this class.
     class _HttpProtocol(HttpToolsProtocol):
@@ -69,8 +69,12 @@ class HttpConnection(_HttpProtocol):
         self._got_body = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Takes the connection, if there may be another one."""
-        self._connection = self._table.admit(transport, self.loop)
+        """Takes the connection, if there may be another one. With TLS it has been admitted already."""
+        if isinstance(transport, Connection):
+            self._connection = transport
+        else:
+            self._connection = Connection(transport, self._table, self.loop)
+            self._table.admit(self._connection)
         self._over = self._connection.is_closing()
         if not self._over:
             super().connection_made(self._connection)

@@ -22,7 +22,9 @@ import uvicorn
 
 from lanestream.api.app import create_app
 from lanestream.api.auth import warn_if_open
+from lanestream.api.file_watch import FileWatch
 from lanestream.api.http_connection import HttpConnection
+from lanestream.api.tls import Certificate, TlsProtocol
 from lanestream.api.websocket_connection import WebSocketConnection
 from lanestream.errors import SettingsError
 from lanestream.host import keep_freed_memory, raise_open_files, return_freed_memory
@@ -33,8 +35,6 @@ from lanestream.workers.process_pool import ProcessPool
 from lanestream.workers.thread_pool import ThreadPool
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from fastapi import FastAPI
 
     from lanestream.api.service import DrawLanes, Service
@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 _BACKLOG: Final = 2048
 _LARGEST_KEPT_BYTES: Final = 1 << 20
 _RETURN_MEMORY_S: Final = 10.0
-_KEYS_POLL_S: Final = 1.0
+_FILES_POLL_S: Final = 1.0
 # Files that the process needs besides its connections: models, pipes to workers, Redis, logs.
 _OTHER_FILES: Final = 128
 # After a drain, how long uvicorn waits for peers to close their connections.
@@ -91,12 +91,13 @@ def listen(host: str, port: int) -> socket.socket:
         raise SettingsError(f"can't listen on {host}, port {port}: {reason}", "check --host and --port") from None
 
 
-def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
+def server_config(app: FastAPI, settings: Settings, certificate: Certificate | None = None) -> uvicorn.Config:
     """Returns the uvicorn configuration for `app`."""
     service: Service = app.state.service
+    protocol = HttpConnection if certificate is None else partial(TlsProtocol, certificate)
     return uvicorn.Config(
         app,
-        http=partial(HttpConnection, service.connections),  # type: ignore[arg-type]
+        http=partial(protocol, service.connections),  # type: ignore[arg-type]
         ws=WebSocketConnection,
         # An image above `max_bytes` costs only that frame. A far larger message closes the socket, not the session.
         ws_max_size=2 * settings.max_bytes,
@@ -114,9 +115,17 @@ class LanestreamServer(uvicorn.Server):
     """A uvicorn server that answers the frames it has accepted before it stops."""
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
-        super().__init__(server_config(app, settings))
+        self.certificate = (
+            None if settings.tls_certificate is None else Certificate(settings.tls_certificate, settings.tls_key)
+        )
+        super().__init__(server_config(app, settings, self.certificate))
         self._service: Service = app.state.service
-        self.keys_requested = False
+        self.watches: list[FileWatch] = []
+        if settings.api_keys_file is not None:
+            self.watches.append(FileWatch([settings.api_keys_file], self._service.reload_keys))
+        if self.certificate is not None:
+            self.watches.append(FileWatch(self.certificate.files, self.certificate.reload))
+        self.reload_requested = False
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -127,15 +136,15 @@ class LanestreamServer(uvicorn.Server):
     def stopping_on_signals(self) -> Iterator[None]:
         """Stops the server on SIGINT, SIGTERM or SIGHUP; ends the process at once on a second SIGINT or SIGTERM.
 
-        With a file of API keys, SIGHUP reads it again instead, as is usual for services.
+        With a file of API keys or a certificate, SIGHUP reads them again instead, as is usual for services.
 
         After the block the process ends by the first of them, so that its parent sees why it ended.
         """
         received: list[int] = []
 
         def stop(number: int, _: FrameType | None) -> None:
-            if number == signal.SIGHUP and self._service.settings.api_keys_file is not None:
-                self.keys_requested = True
+            if number == signal.SIGHUP and self.watches:
+                self.reload_requested = True
                 return
             if received and number != signal.SIGHUP:
                 flush_logs()
@@ -178,7 +187,8 @@ async def _serve(
     warn_if_open(app.state.service.authenticator, host, loopback=ipaddress.ip_address(host).is_loopback)
     for conflict in package_conflicts():
         _log.warning("%s", conflict)
-    url = _http_url(host, port)
+    scheme = "http" if server.certificate is None else "https"
+    url = _http_url(scheme, host, port)
     _log.info("listening on %s, loading the networks", url, extra={"event": "listening", "url": url})
     starting = asyncio.create_task(_start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
@@ -207,45 +217,30 @@ async def _serve(
             loopback = "127.0.0.1" if address.version == 4 else "::1"
             reachable = loopback if address.is_unspecified else host
             # A daemon: what it starts, such as a browser in a terminal, may go on for as long as it likes.
-            threading.Thread(target=on_ready, args=(_http_url(reachable, port),), daemon=True).start()
+            threading.Thread(target=on_ready, args=(_http_url(scheme, reachable, port),), daemon=True).start()
     except BaseException:
         server.should_exit = True
         await serving
         raise
     upkeep = [asyncio.create_task(_return_memory())]
-    if app.state.service.settings.api_keys_file is not None:
-        upkeep.append(asyncio.create_task(_watch_keys(server, app.state.service)))
+    if server.watches:
+        upkeep.append(asyncio.create_task(_watch_files(server)))
     await serving
     for task in upkeep:
         task.cancel()
 
 
-async def _watch_keys(server: LanestreamServer, service: Service) -> None:
-    """Reads the file of API keys again when it has changed, and when SIGHUP asks for it."""
-    path = service.settings.api_keys_file
-    assert path is not None  # noqa: S101 - checked by the caller
-    loaded, previous = None, None
+async def _watch_files(server: LanestreamServer) -> None:
+    """Reads the files of API keys and certificates again when they have changed, and when SIGHUP asks for it."""
     while True:
-        await asyncio.sleep(_KEYS_POLL_S)
-        found = await asyncio.to_thread(_version_of, path)
-        # A file that is still being written may lack keys, so it must not have changed since the last look.
-        if server.keys_requested or (found != loaded and found == previous):
-            server.keys_requested, loaded = False, found
-            service.reload_keys()
-        previous = found
+        await asyncio.sleep(_FILES_POLL_S)
+        requested, server.reload_requested = server.reload_requested, False
+        for watch in server.watches:
+            watch.check(await asyncio.to_thread(watch.versions), force=requested)
 
 
-def _version_of(path: Path) -> tuple[int, ...] | None:
-    """Returns what changes with the content of a file, also if another one takes its place; None if it is missing."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
-
-
-def _http_url(host: str, port: int) -> str:
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+def _http_url(scheme: str, host: str, port: int) -> str:
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 async def _return_memory() -> None:
