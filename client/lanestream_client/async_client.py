@@ -31,6 +31,7 @@ from lanestream_client.client_protocol import ClientProtocol
 from lanestream_client.endpoint import (
     READY_TIMEOUT_S,
     connect_options,
+    handshake_errors,
     http_errors,
     http_options,
     parse_endpoints,
@@ -213,7 +214,9 @@ class AsyncLaneStream:
         """Yields results until the stream has finished. Raises LanestreamError if the connection fails."""
         protocol, failover, timeout = self._protocol, self._failover, self._failover.timeout_s
         with websocket_errors(failover.endpoint):
-            async with connect(**connect_options(failover.endpoint, timeout)) as socket:
+            with handshake_errors(failover.endpoint):
+                connection = await connect(**connect_options(failover.endpoint, timeout))
+            async with connection as socket:
                 await socket.send(protocol.start_message())
                 answer = await asyncio.wait_for(socket.recv(), max(timeout, READY_TIMEOUT_S))
                 results = await tasks.locked(partial(protocol.receive_ready, answer))

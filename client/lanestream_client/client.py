@@ -32,6 +32,7 @@ from lanestream_client.client_protocol import ClientProtocol
 from lanestream_client.endpoint import (
     READY_TIMEOUT_S,
     connect_options,
+    handshake_errors,
     http_errors,
     http_options,
     parse_endpoints,
@@ -213,21 +214,21 @@ class LaneStream:
     def _results_of_connection(self, threads: _StreamThreads) -> Generator[StreamResult]:
         """Yields results until the stream has finished. Raises LanestreamError if the connection fails."""
         protocol, failover, timeout = self._protocol, self._failover, self._failover.timeout_s
-        with (
-            websocket_errors(failover.endpoint),
-            connect(**connect_options(failover.endpoint, timeout)) as socket,
-        ):
-            socket.send(protocol.start_message())
-            answer = socket.recv(max(timeout, READY_TIMEOUT_S))
-            results = threads.locked(partial(protocol.receive_ready, answer))
-            failover.connected()
-            with threads.sending_to(socket):
-                yield from results
-                while protocol.summary is None:
-                    results = threads.locked(partial(protocol.receive, socket.recv()))
-                    if results:
-                        failover.progressed()
+        with websocket_errors(failover.endpoint):
+            with handshake_errors(failover.endpoint):
+                connection = connect(**connect_options(failover.endpoint, timeout))
+            with connection as socket:
+                socket.send(protocol.start_message())
+                answer = socket.recv(max(timeout, READY_TIMEOUT_S))
+                results = threads.locked(partial(protocol.receive_ready, answer))
+                failover.connected()
+                with threads.sending_to(socket):
                     yield from results
+                    while protocol.summary is None:
+                        results = threads.locked(partial(protocol.receive, socket.recv()))
+                        if results:
+                            failover.progressed()
+                        yield from results
 
     def _handle_failure(self, failure: LanestreamError, threads: _StreamThreads) -> Generator[StreamResult]:
         """Yields the results that were lost and waits for the next attempt. Raises `failure` if there is none."""

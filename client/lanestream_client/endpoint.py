@@ -168,6 +168,15 @@ def websocket_errors(endpoint: Endpoint) -> Iterator[None]:
 
 
 @contextmanager
+def handshake_errors(endpoint: Endpoint) -> Iterator[None]:
+    """Converts the exception in the block for a connection that ends during the handshake to a LanestreamError."""
+    try:
+        yield
+    except ConnectionClosed as error:
+        raise _unreachable_error(endpoint, error.__cause__ or ConnectionError("the connection was closed")) from None
+
+
+@contextmanager
 def http_errors(endpoint: Endpoint) -> Iterator[None]:
     """Converts httpx's exceptions in the block to ConnectionFailedErrors."""
     try:
@@ -200,7 +209,7 @@ def refusal_error(status: int, body: bytes | bytearray, endpoint: Endpoint) -> L
     return ConnectionFailedError(answer, "check that a Lanestream service runs at this URL")
 
 
-def _unreachable_error(endpoint: Endpoint, error: Exception) -> ConnectionFailedError:
+def _unreachable_error(endpoint: Endpoint, error: BaseException) -> ConnectionFailedError:
     timed_out = isinstance(error, TimeoutError | httpx.TimeoutException)
     reason = "the connection timed out" if timed_out else redact_urls(re.sub(r"^\[Errno -?\d+\] ", "", str(error)))
     reason = one_line(reason) or type(error).__name__

@@ -41,7 +41,8 @@ def tls_context(ca_file: str | Path | None, client_certificate: str | Path | Non
 def tls_hint(error: BaseException) -> str | None:
     """Returns what to do about a connection that failed because of TLS; None if it failed for another reason."""
     found = next((each for each in _causes(error) if isinstance(each, ssl.SSLError)), None)
-    if found is None:
+    # A connection that just ended may have done so for any reason.
+    if found is None or isinstance(found, ssl.SSLEOFError):
         return None
     if isinstance(found, ssl.SSLCertVerificationError):
         if found.verify_code in _OTHER_HOST:
