@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import time
@@ -71,12 +72,17 @@ def stop(process: subprocess.Popen[bytes]) -> None:
         process.kill()
 
 
-def wait_until_ready(process: subprocess.Popen[bytes], url: str, log_path: Path) -> None:
-    """Returns when the networks are warm. Exits with the service's log if it does not get ready."""
+def wait_until_ready(
+    process: subprocess.Popen[bytes], url: str, log_path: Path, tls: ssl.SSLContext | None = None
+) -> None:
+    """Returns when the networks are warm. Exits with the service's log if it does not get ready.
+
+    `tls` is how to connect to a service with a certificate that the system does not trust.
+    """
     end = time.monotonic() + READY_S
     while time.monotonic() < end and process.poll() is None:
         try:
-            if httpx.get(f"{url}/readyz").is_success:
+            if httpx.get(f"{url}/readyz", verify=tls or True).is_success:
                 return
         except httpx.TransportError:
             pass

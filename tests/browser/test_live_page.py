@@ -17,10 +17,11 @@ import cv2
 import numpy as np
 import processes
 import pytest
+import trustme
 from av.video.stream import VideoStream
 from livepage import WAIT_S, LivePage
 from numpy.typing import NDArray
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 from redisserver import redis_server
 
 from lanestream.keys import new_key
@@ -242,6 +243,20 @@ def test_on_an_insecure_origin_the_demo_plays_and_the_camera_is_explained(live: 
         live.page.keyboard.press("c")
         expect(live.page.locator("#alerts")).to_contain_text("https:// and localhost only. Open the page under one of")
         live.leave()
+
+
+def test_with_a_certificate_the_camera_streams_from_another_machine(browser: Browser, tmp_path: Path) -> None:
+    address, certificate = own_address(), tmp_path / "certificate.pem"
+    trustme.CA().issue_cert(address).private_key_and_cert_chain_pem.write_to_path(str(certificate))
+    with processes.service(host=address, tls_certificate=certificate) as (_, url):
+        # The browser does not know the authority of the certificate.
+        page = browser.new_page(ignore_https_errors=True)
+        live = LivePage(page, tmp_path / "page.png")
+        live.open(url, REGRESSION)
+        page.keyboard.press("c")
+        live.wait_until_drawn(5)
+        assert live.attribute("source") == "camera"
+        page.context.close()
 
 
 def own_address() -> str:

@@ -17,12 +17,13 @@ from attack import (
     races,
     redis_outages,
     stops,
+    tls,
     workers,
 )
 from attack.definition import Attack
 
 _MODULES: Final = (
-    *(heads, connections, never_read, not_frames, memory, costly),
+    *(heads, connections, never_read, not_frames, memory, costly, tls),
     *(stops, logs, races, redis_outages, clock, workers),
 )
 ATTACKS: Final[tuple[Attack, ...]] = tuple(attack for module in _MODULES for attack in module.ATTACKS)

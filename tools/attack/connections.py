@@ -21,11 +21,11 @@ _COUNT: Final = 2000
 _SHORT_COUNT: Final = 1200
 
 
-async def _hold(open_connection: Open[Connection], use: Use[Connection], stop_at: float, count: int) -> None:
+async def hold(open_connection: Open[Connection], use: Use[Connection], stop_at: float, count: int) -> None:
     """Holds `count` connections until `stop_at`. Raises UnexpectedError if some were held for too long."""
     old = 0
 
-    async def hold(connection: Connection) -> None:
+    async def use_once(connection: Connection) -> None:
         nonlocal old
         since = time.monotonic()
         try:
@@ -33,19 +33,19 @@ async def _hold(open_connection: Open[Connection], use: Use[Connection], stop_at
         finally:
             old += time.monotonic() - since > _OLDEST_S
 
-    await repeat(open_connection, hold, stop_at, count, _REOPEN_S)
+    await repeat(open_connection, use_once, stop_at, count, _REOPEN_S)
     if old:
         raise UnexpectedError(f"{old} connections were held for more than {_OLDEST_S:g} s")
 
 
 async def _connections(use: Use[Connection], source: str | None, target: Target, stop_at: float, count: int) -> None:
     """Holds connections from the address `source`."""
-    await _hold(partial(Connection.open, target, source=source), use, stop_at, count)
+    await hold(partial(Connection.open, target, source=source), use, stop_at, count)
 
 
 async def silent_streams(target: Target, stop_at: float, count: int) -> None:
     """Holds streams that never send a message."""
-    await _hold(partial(Stream.open, target), Connection.discard, stop_at, count)
+    await hold(partial(Stream.open, target), Connection.discard, stop_at, count)
 
 
 async def _send(data: bytes, connection: Connection) -> None:

@@ -323,7 +323,7 @@ async def _stream_once(target: Target, jpeg: bytes) -> float:
 
 async def _check_health(target: Target) -> float:
     """Requests /healthz over a fresh connection and returns when its answer arrived."""
-    reader, writer = await asyncio.open_connection(target.host, target.port)
+    reader, writer = await asyncio.open_connection(target.host, target.port, ssl=target.tls)
     try:
         writer.write(head("GET", "/healthz", ("Connection", "close")) + b"\r\n")
         line = await reader.readline()
@@ -338,7 +338,8 @@ async def _check_health(target: Target) -> float:
 async def _connected(target: Target) -> AsyncIterator[ClientConnection]:
     """Opens a stream. It is aborted, not closed, at an error: closing waits for a service that may be stuck."""
     async with connect(
-        f"ws://{target.host}:{target.port}/v1/stream",
+        f"{target.url.replace('http', 'ws')}/v1/stream",
+        ssl=target.tls,
         subprotocols=[Subprotocol("lanestream.v1")],
         additional_headers={"Authorization": f"Bearer {target.camera_key}"},
         compression=None,

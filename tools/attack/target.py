@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import resource
+import ssl
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
@@ -42,7 +43,12 @@ class Target:
     @property
     def url(self) -> str:
         """The URL of the service."""
-        return f"http://{self.host}:{self.port}"
+        return f"{_scheme(self.environment)}://{self.host}:{self.port}"
+
+    @property
+    def tls(self) -> ssl.SSLContext | None:
+        """How to connect to the service over TLS; None if it has no certificate."""
+        return None if _scheme(self.environment) == "http" else unverified()
 
     def setting(self, name: str) -> str:
         """Returns a setting that the service was started with. Raises KeyError if it has its default."""
@@ -114,10 +120,21 @@ def _running(environment: Mapping[str, str], log: Path, unread_log: bool) -> Ite
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (min(_OPEN_FILES, most), most))
     try:
-        wait_until_ready(process, f"http://127.0.0.1:{port}", log)
+        wait_until_ready(process, f"{_scheme(environment)}://127.0.0.1:{port}", log, unverified())
         yield process.pid, port
     finally:
         _kill(process)
+
+
+def unverified() -> ssl.SSLContext:
+    """Returns how to connect over TLS, whatever certificate the service has."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    return context
+
+
+def _scheme(environment: Mapping[str, str]) -> str:
+    return "https" if "LANESTREAM_TLS_CERTIFICATE" in environment else "http"
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

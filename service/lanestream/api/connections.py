@@ -54,9 +54,8 @@ _LOG_EVERY_S: Final = 10.0
 # Requests of one address, on average and as a burst. Most take less than a millisecond of the event loop.
 _REQUESTS_PER_S: Final = 500.0
 _REQUEST_BURST_S: Final = 1.0
-# TLS handshakes of one address, on average and as a burst. Most take a millisecond of the event loop, with RSA keys of
-# 4096 bits several.
-_HANDSHAKES_PER_S: Final = 100.0
+# TLS handshakes of one address, on average and as a burst. With usual keys they take a millisecond of the event loop.
+_HANDSHAKES_PER_S: Final = 250.0
 _HANDSHAKE_BURST_S: Final = 1.0
 # The rate of messages of all connections of a caller, as a multiple of that of one connection.
 _CALLER_RATE: Final = 8.0

@@ -88,6 +88,9 @@ class Certificate:
 class TlsConnection(Connection):
     """A connection that encrypts what is written to it; `context` has the certificate."""
 
+    # It exists from `begin` on, before any other use of TLS.
+    _tls: ssl.SSLObject
+
     def __init__(
         self,
         transport: asyncio.Transport,
@@ -98,11 +101,14 @@ class TlsConnection(Connection):
         super().__init__(transport, table, loop)
         self._context = context
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-        self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
         self._finished = False
         self._bytes_without_data = 0
         # What receives the decrypted data; None before the end of the handshake.
         self.protocol: asyncio.Protocol | None = None
+
+    def begin(self) -> None:
+        """Takes what a handshake needs, which a connection that only waits for its turn does without."""
+        self._tls = self._context.wrap_bio(self._incoming, self._outgoing, server_side=True)
 
     def receive(self, data: bytes) -> None:
         """Takes encrypted data, for `shake_hands` and `read`."""
@@ -246,6 +252,7 @@ class TlsProtocol(asyncio.Protocol):
     def _begin_handshake(self) -> None:
         if not self._connection.is_closing():
             self._has_turn = True
+            self._connection.begin()
             self._connection.hold_reading(False)
             self._shake_hands()
 
