@@ -1,8 +1,9 @@
 """`make up-check`: runs all of docker/compose.yaml with `make up`, and checks it from outside, as its operator would.
 
-It needs docker with Compose, or podman with podman-compose. It works in a copy of the checkout under a Compose project of
-its own, on free ports, so it does not touch a stack that runs already. Where the images of Redis, Prometheus or Grafana
-can't be pulled, it builds the stand-ins of tools/stand_ins. Prints one line per check; the exit code is 1 if one failed.
+It needs docker with Compose, or podman with podman-compose. It works in a copy of the checkout, under a Compose project
+of its own and on free ports, so it does not touch a stack that runs already. Where the images of Redis, Prometheus or
+Grafana can't be pulled, it builds the stand-ins of tools/stand_ins. Prints one line per check; the exit code is 1 if
+one failed.
 """
 
 from __future__ import annotations
@@ -212,7 +213,11 @@ def removed_at_end(stack: Stack) -> Iterator[Stack]:
     finally:
         command = ["docker/compose", stack.engine.command, "cpu", "down", "--volumes"]
         subprocess.run(
-            command, cwd=stack.folder, capture_output=True, check=False, env={**os.environ, "COMPOSE_PROJECT_NAME": PROJECT}
+            command,
+            cwd=stack.folder,
+            capture_output=True,
+            check=False,
+            env={**os.environ, "COMPOSE_PROJECT_NAME": PROJECT},
         )
 
 
@@ -259,7 +264,9 @@ def check_containers(stack: Stack) -> None:
 def healthy(engine: Engine, container: str) -> bool:
     """Returns whether a container's health check passes. Podman runs it now: without systemd, nothing else does."""
     if engine.command == "podman":
-        return not subprocess.run(["podman", "healthcheck", "run", container], capture_output=True, check=False).returncode
+        return not subprocess.run(
+            [engine.command, "healthcheck", "run", container], capture_output=True, check=False
+        ).returncode
     return bool(engine.inspect("container", container)["State"]["Health"]["Status"] == "healthy")
 
 
@@ -271,7 +278,10 @@ def check_ready(stack: Stack, *, store_reachable: bool) -> None:
             answer = httpx.get(f"{stack.url}/readyz")
         except httpx.TransportError:
             return False
-        return answer.is_success and (answer.json()["store"], answer.json()["store_reachable"]) == ("redis", store_reachable)
+        return answer.is_success and (answer.json()["store"], answer.json()["store_reachable"]) == (
+            "redis",
+            store_reachable,
+        )
 
     wait_until(matches, f"/readyz does not become 200 with store_reachable {store_reachable}")
     passed(f"/readyz: 200, Redis {'can' if store_reachable else 'can not'} be reached")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import fakes
 import httpx
@@ -29,10 +30,8 @@ def read_only_replica(redis: Redis, _: Path) -> None:
 
 
 def failed_background_save(redis: Redis, folder: Path) -> None:
-    (folder / "data").mkdir()
     redis.config_set("save", "3600 1")
-    redis.config_set("dir", str(folder / "data"))
-    shutil.rmtree(folder / "data")
+    shutil.rmtree(folder)
     redis.bgsave()
     wait_until(lambda: redis.info("persistence")["rdb_last_bgsave_status"] == "err")  # type: ignore[index]
 
@@ -57,13 +56,13 @@ def no_answer(redis: Redis, _: Path) -> None:
 
 
 REFUSALS = {
-    out_of_memory: "OOM",
-    read_only_replica: "READONLY",
-    failed_background_save: "MISCONF",
-    changed_password: "Authentication required",
-    revoked_permission: "NOPERM|No permissions|can't access",
+    out_of_memory: "used memory > 'maxmemory'",
+    read_only_replica: "read only replica",
+    failed_background_save: "unable to persist|MISCONF",
+    changed_password: "authenticated",
+    revoked_permission: "permissions",
     too_many_clients: "max number of clients",
-    no_answer: "Timeout|no answer",
+    no_answer: "no answer|Timeout",
 }
 
 
@@ -85,33 +84,72 @@ def metric(url: str, name: str) -> float:
     return float(next(line.split()[1] for line in lines if line.startswith(f"{name} ")))
 
 
-def events(caplog: pytest.LogCaptureFixture) -> list[Any]:
-    found = [getattr(record, "event", None) for record in caplog.records]
-    return [event for event in found if event in {"store_lost", "store_restored"}]
+def lines_about_saving(capfd: pytest.CaptureFixture[str]) -> list[str]:
+    """Returns the lines of the log since the last call that say whether sessions are saved."""
+    return [line for line in capfd.readouterr().err.splitlines() if "sessions are" in line]
 
 
 @pytest.mark.parametrize("streams", [0, 2])
 @pytest.mark.parametrize("refuse", REFUSALS, ids=lambda refuse: refuse.__name__)
 def test_a_refusal_is_visible_everywhere_and_streams_go_on(
-    serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture, refuse: Callable[[Redis, Path], None], streams: int
+    serve: Serve, tmp_path: Path, capfd: pytest.CaptureFixture[str], refuse: Callable[[Redis, Path], None], streams: int
 ) -> None:
-    with running_redis(tmp_path) as server, Redis.from_url(server.url) as redis:
+    (tmp_path / "redis").mkdir()
+    with running_redis(tmp_path / "redis") as server, Redis.from_url(server.url) as redis, ExitStack() as stack:
         url = serve(fakes.engine(), redis_url=server.url)
-        sockets = [stream(url, mode="all") for _ in range(streams)]
-        opened = [socket.__enter__() for socket in sockets]
+        sockets = [stack.enter_context(stream(url, mode="all")) for _ in range(streams)]
         assert readiness(url) == ("redis", True)
-        refuse(redis, tmp_path)
+        refuse(redis, tmp_path / "redis")
 
-        def frames_are_answered_and_the_loss_is_seen() -> bool:
-            for socket in opened:
+        def loss_is_reported() -> bool:
+            for socket in sockets:
                 socket.send(fakes.image_file())
                 assert receive(socket)["type"] == "lanes"
             return readiness(url) == ("redis", False)
 
-        wait_until(frames_are_answered_and_the_loss_is_seen)
+        wait_until(loss_is_reported)
         assert metric(url, "lane_store_reachable") == 0
         assert metric(url, "lane_store_failures_total") > 0
-        assert frames_are_answered_and_the_loss_is_seen()
-        for socket in sockets:
-            socket.__exit__(None, None, None)
-    assert events(caplog) == ["store_lost"]
+        assert loss_is_reported()
+    (line,) = lines_about_saving(capfd)
+    assert re.search(f"WARNING .*: sessions are not saved .*({REFUSALS[refuse]})", line)
+
+
+def test_the_end_of_a_refusal_is_reported(serve: Serve, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with running_redis(tmp_path) as server, Redis.from_url(server.url) as redis:
+        url = serve(fakes.engine(), redis_url=server.url)
+        out_of_memory(redis, tmp_path)
+        wait_until(lambda: readiness(url) == ("redis", False))
+        redis.config_set("maxmemory", "0")
+        wait_until(lambda: readiness(url) == ("redis", True))
+        assert metric(url, "lane_store_reachable") == 1
+    lost, restored, *_ = lines_about_saving(capfd)
+    assert "sessions are not saved" in lost
+    assert "sessions are saved again" in restored
+
+
+def test_a_wrong_password_is_reported_before_the_first_stream(
+    serve: Serve, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running_redis(tmp_path) as server:
+        with Redis.from_url(server.url) as redis:
+            redis.config_set("requirepass", "right-password")
+        url = serve(fakes.engine(), redis_url=server.url.replace("//", "//:wrong-password@"))
+        wait_until(lambda: readiness(url) == ("redis", False))
+    (line,) = lines_about_saving(capfd)
+    assert "invalid username-password pair" in line
+    assert "wrong-password" not in line
+
+
+def test_after_a_failover_sessions_are_saved_in_the_new_primary(serve: Serve, tmp_path: Path) -> None:
+    (tmp_path / "new").mkdir()
+    with running_redis(tmp_path) as old, running_redis(tmp_path / "new") as new, tcp_proxy(old.port) as proxy:
+        url = serve(fakes.engine(), redis_url=f"redis://127.0.0.1:{proxy.port}/0")
+        with stream(url, mode="all") as socket, Redis.from_url(old.url) as former, Redis.from_url(new.url) as primary:
+            socket.send(fakes.image_file())
+            assert receive(socket)["type"] == "lanes"
+            # The name of the primary leads to the new one, and the old one keeps its connections.
+            proxy.redirect(new.port)
+            former.replicaof("127.0.0.1", str(new.port))
+            wait_until(lambda: any(not key.startswith(b"lanestream:session:check") for key in primary.scan_iter()))
+            assert readiness(url) == ("redis", True)
