@@ -88,7 +88,7 @@ PRINTED = {
     "import { readFile }*": "type: 'lanes'",
 }
 # Blocks in these languages are data or belong to other programs.
-NOT_CODE = {"html", "json", "nginx", "text", "toml", "yaml"}
+NOT_CODE = {"caddyfile", "haproxy", "html", "json", "nginx", "text", "toml", "yaml"}
 # Commands that are safe to run. Others must be listed above.
 SAFE = {"curl", "head", "lanestream", "make"}
 # With Node 20 `WebSocket` is an option.
