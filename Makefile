@@ -12,8 +12,9 @@ BIN := $(VENV)/bin
 VIDEO ?=
 ARGS ?=
 
-# Docker, or podman if docker is missing. The image's variant is cpu or gpu.
-ENGINE ?= $(if $(shell command -v docker),docker,podman)
+# Docker, or podman if docker does not run. The image's variant is cpu or gpu. BUILD_OPTIONS are further options for
+# the engine's `build`.
+ENGINE ?= $(if $(shell docker info >/dev/null 2>&1 || ! command -v podman || echo podman),podman,docker)
 VARIANT ?= cpu
 VERSION = $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' service/lanestream/__init__.py)
 REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
@@ -25,7 +26,7 @@ DEV_READY := $(VENV)/.ready-dev
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack batch-ray batch-speed bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean js js-types
+.PHONY: attack batch-ray batch-speed bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up compose-ready down up-check clean js js-types
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -188,21 +189,26 @@ moving-picture: $(DEV_READY)
 # Podman's own image format can't store a health check.
 image:
 	$(ENGINE) build $(if $(findstring podman,$(ENGINE)),--format docker) -f docker/Dockerfile --target $(VARIANT) \
-	  $(if $(BASE_IMAGE),--build-arg BASE_IMAGE=$(BASE_IMAGE)) --build-arg VERSION=$(VERSION) --build-arg REVISION=$(REVISION) -t lanestream:$(VARIANT) .
+	  $(if $(BASE_IMAGE),--build-arg BASE_IMAGE=$(BASE_IMAGE)) --build-arg VERSION=$(VERSION) --build-arg REVISION=$(REVISION) \
+	  -t lanestream:$(VARIANT) $(BUILD_OPTIONS) .
 
 image-test: $(RUN_READY)
 	$(BIN)/python tools/image_check.py --target $(VARIANT)
 
-COMPOSE = $(ENGINE) compose -f docker/compose.yaml --profile $(VARIANT)
+up: compose-ready image
+	docker/up $(ENGINE) $(VARIANT)
 
-up: image
-	docker/make-secrets $(ENGINE) run --rm lanestream:$(VARIANT)
-	$(COMPOSE) up --detach --wait
-	@echo "service: http://$${LANESTREAM_PUBLISH:-127.0.0.1:8000}, key in docker/secrets/local_key"
-	@echo "dashboard: http://$${GRAFANA_PUBLISH:-127.0.0.1:3000}, user admin, password in docker/secrets/grafana_password"
+# Fails before the image is built, which takes minutes.
+compose-ready:
+	@docker/compose $(ENGINE) $(VARIANT) version >/dev/null
 
 down:
-	$(COMPOSE) down
+	docker/compose $(ENGINE) $(VARIANT) down
+
+# Runs all of compose.yaml, under a name of its own, and checks it from outside.
+up-check: $(DEV_READY)
+	$(BIN)/python tools/up_check.py --engine $(ENGINE) $(if $(BASE_IMAGE),--base-image $(BASE_IMAGE)) \
+	  $(if $(BUILD_OPTIONS),--build-options "$(BUILD_OPTIONS)")
 
 clean:
 	rm -rf $(VENV) client/js/node_modules client/js/dist out .mypy_cache .ruff_cache .pytest_cache .hypothesis

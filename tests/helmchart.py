@@ -32,6 +32,11 @@ BASE: dict[str, Any] = {
     "apiKeys": {"entries": [ENTRY]},
 }
 INGRESS = {"enabled": True, "host": "lanes.example.com", "tlsSecret": "lanes-tls"}
+GATEWAY = {
+    "enabled": True,
+    "host": "lanes.example.com",
+    "parentRefs": [{"name": "public", "namespace": "gateways", "sectionName": "https"}],
+}
 SCRAPED = {"serviceMonitor": {"enabled": True, "keySecret": {"name": "keys"}}, "prometheusRule": {"enabled": True}}
 VARIANTS: dict[str, dict[str, Any]] = {
     "cpu": BASE,
@@ -55,6 +60,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "hpa": {**BASE, "autoscaling": {"kind": "hpa"}, "metrics": SCRAPED},
     "keda": {**BASE, "autoscaling": {"kind": "keda", "prometheusUrl": "http://prometheus:9090"}, "metrics": SCRAPED},
     "ingress": {**BASE, "ingress": INGRESS, "trustedProxies": "10.0.0.0/8", "settings": {"max_bytes": 16 << 20}},
+    "gateway": {**BASE, "gateway": GATEWAY},
     "traces": {
         **BASE,
         "tracing": {"endpoint": "http://collector.monitoring:4318", "sampleRatio": 0.001},

@@ -35,6 +35,10 @@ class TcpProxy:
                 for source, sink in (ends, ends[::-1]):
                     threading.Thread(target=self._forward, args=(source, sink)).start()
 
+    def redirect(self, port: int) -> None:
+        """Forwards new connections to another port of this machine. Open ones stay where they are."""
+        self._target = ("127.0.0.1", port)
+
     def cut(self) -> None:
         """Breaks all open connections."""
         for end in self._sockets:

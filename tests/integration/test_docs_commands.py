@@ -32,7 +32,7 @@ from lanestream.cli import cli
 from lanestream.keys import new_key
 from lanestream_exporter.scenes import sample_clip, write_clip
 
-DOCKER = "needs Docker; `make image-test` checks the image"
+DOCKER = "needs a container engine; `make image-test` and `make up-check` check it"
 LONG = "takes too long"
 SYSTEM = "changes the system; the tests of the unit are in tests/unit/deploy"
 ANY = "any page"
@@ -52,10 +52,12 @@ NOT_RUN = [
     ("docs/client.md", "import asyncio*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import cv2*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import rerun*", "tests/integration/test_clients.py"),
-    ("docs/deployment.md", "make up", DOCKER),
+    ("docs/deployment.md", "make up*", DOCKER),
+    ("docs/deployment.md", "apt install *", DOCKER),
+    ("docs/deployment.md", "pipx install *", DOCKER),
     ("docs/deployment.md", "make image*", DOCKER),
     ("docs/deployment.md", "docker *", DOCKER),
-    ("docs/deployment.md", "LANESTREAM_PUBLISH=* docker compose *", DOCKER),
+    ("docs/deployment.md", "LANESTREAM_PUBLISH=* docker/compose *", DOCKER),
     ("docs/deployment.md", "*/opt/lanestream*", SYSTEM),
     ("docs/deployment.md", "*/etc/lanestream*", SYSTEM),
     ("docs/deployment.md", "cp * /etc/systemd/*", SYSTEM),
@@ -88,7 +90,7 @@ PRINTED = {
     "import { readFile }*": "type: 'lanes'",
 }
 # Blocks in these languages are data or belong to other programs.
-NOT_CODE = {"html", "json", "nginx", "text", "toml", "yaml"}
+NOT_CODE = {"caddyfile", "haproxy", "html", "json", "nginx", "text", "toml", "yaml"}
 # Commands that are safe to run. Others must be listed above.
 SAFE = {"curl", "head", "lanestream", "make"}
 # With Node 20 `WebSocket` is an option.

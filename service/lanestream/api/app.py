@@ -35,6 +35,7 @@ def create_app(engine: Engine | None, settings: Settings, draw: DrawLanes | None
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        service.sessions.begin()
         yield
         await service.close()
 

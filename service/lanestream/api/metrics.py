@@ -90,7 +90,7 @@ class Metrics:
         self._connections = self._gauge("lane_connections", "TCP connections.")
         self._buffered = self._gauge("lane_buffered_bytes", "Received images and unsent pictures that are kept.")
         self._store_reachable = self._gauge(
-            "lane_store_reachable", "1 if the last operation of the session store succeeded."
+            "lane_store_reachable", "1 if sessions can be saved: no operation of the session store failed lately."
         )
         self._log_drops = self._gauge("lane_log_records_dropped", "Log records that were dropped since the start.")
         self._queue = self._gauge("lane_queue_depth", "Inference requests still waiting when the last batch started.")

@@ -22,7 +22,7 @@ with needs_extra("cluster"):
     from redis.asyncio import Redis
     from redis.asyncio.retry import Retry
     from redis.backoff import ExponentialBackoff
-    from redis.exceptions import RedisError, ResponseError
+    from redis.exceptions import ReadOnlyError, RedisError, ResponseError
 
 if TYPE_CHECKING:
     from lanestream.streaming.store import StoredSession
@@ -39,6 +39,8 @@ _BACKOFF_S: Final = (0.01, 0.1)
 _HEALTH_CHECK_S: Final = 10
 # After a failure, operations fail at once for this long instead of waiting for their own time limits.
 _PAUSE_S: Final = 1.0
+# A session that was saved to check Redis expires after this many milliseconds.
+_CHECK_TTL_MS: Final = 10_000
 
 # Redis runs each script atomically, so two replicas can't both become the owner of a session. A script may run twice,
 # because an operation is retried if its answer was lost; the second run changes nothing and has the same answer.
@@ -86,6 +88,8 @@ class RedisStore:
                 socket_connect_timeout=_TRY_S,
                 health_check_interval=_HEALTH_CHECK_S,
                 retry=Retry(ExponentialBackoff(cap=cap, base=base), _RETRIES),
+                # After a failover, old connections lead to what is now a replica, and new ones to the primary.
+                retry_on_error=[ReadOnlyError],
                 **keepalive,
             )
         except ValueError:
@@ -147,11 +151,11 @@ class RedisStore:
         async with self._operation():
             await self._run(self._delete, key, self._replica)
 
-    async def ping(self) -> None:
-        """See SessionStore."""
+    async def check(self) -> None:
+        """See SessionStore. Saves a session that nobody has: a Redis that answers may still refuse to write."""
         self._check_pause()
         async with self._operation():
-            await self._redis.ping()
+            await self._run(self._save, f"check:{self._replica}", "", self._replica, b"", _CHECK_TTL_MS)
 
     async def close(self) -> None:
         """Closes the connections and deletes the copies."""

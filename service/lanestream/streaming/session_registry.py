@@ -32,6 +32,9 @@ _EVICTION_S: Final = 2.0
 _UNSAVED_IDS: Final = 8
 # How often the ownership of open sessions in a shared store is renewed.
 _RENEW_S: Final = 1.0
+# The store works again once every operation has succeeded for this long. A Redis that refuses some sessions and accepts
+# others would otherwise be reported as lost and restored many times a second.
+_RESTORED_AFTER_S: Final = 2.0
 # The sessions that one caller may open per second, on average, and in a burst. Resumed ones do not count.
 _OPENS_PER_S: Final = 100.0
 _MOST_OPENS: Final = 400
@@ -156,6 +159,7 @@ class SessionRegistry:
         self._turns: dict[tuple[str, str], _Turn] = {}
         self._opens = TokenBuckets(_OPENS_PER_S, _MOST_OPENS / _OPENS_PER_S)
         self._store_reachable = True
+        self._store_failed_at = -math.inf
         self._renewal: asyncio.Task[None] | None = None
 
     def __len__(self) -> int:
@@ -163,9 +167,9 @@ class SessionRegistry:
 
     @property
     def store_reachable(self) -> bool:
-        """Whether the last operation of the store succeeded.
+        """Whether sessions can be saved: no operation of the store has failed, or none lately.
 
-        It is up to date within about two seconds if the store is shared, from the first stream on.
+        It is up to date within about two seconds if the store is shared.
         """
         return self._store_reachable
 
@@ -229,8 +233,6 @@ class SessionRegistry:
         Of several sockets that resume one session at the same time, the latest gets it. Raises EvictedError for the
         others, BusyError at a limit, and NoDetectorError if the requested detector is not loaded.
         """
-        if self._store.shared and self._renewal is None:
-            self._renewal = asyncio.create_task(self._renew())
         if message.resume_token is None:
             session = self.open(pool, caller, options, message.session)
             return await self._begin(session, _Turn())
@@ -268,6 +270,11 @@ class SessionRegistry:
                 await self._delete(session)
         finally:
             self._discard(session)
+
+    def begin(self) -> None:
+        """Starts the task that renews the ownership of sessions in a shared store, and checks the store."""
+        if self._store.shared:
+            self._renewal = asyncio.create_task(self._renew())
 
     async def stop(self) -> None:
         """Ends the task that renews the ownership of sessions. Call it before the store is closed."""
@@ -437,35 +444,37 @@ class SessionRegistry:
         """Saves the open sessions of a shared store about once a second, even if they get no frames.
 
         So a socket learns soon that another replica resumed its session, the session does not expire while it is in
-        use, and a store that lost it gets it again. Without sessions, only tests whether the store can be reached.
+        use, and a store that lost it gets it again. Without sessions, only checks the store.
         """
         while True:
-            await asyncio.sleep(_RENEW_S)
             try:
                 for session in tuple(self._by_key.values()):
                     if self._clock() - session.saved_at >= _RENEW_S:
                         self.schedule_save(session)
                 if not self._by_key:
-                    await self._store.ping()
+                    await self._store.check()
                     self._note_success()
             except StoreError as error:
                 self._note_failure(error)
             except Exception:
                 _log.exception("sessions were not renewed")
+            await asyncio.sleep(_RENEW_S)
 
     def _note_failure(self, error: StoreError) -> None:
-        """Counts a failure of the store. Logs it unless the last operation failed, too."""
+        """Counts a failure of the store. Logs only the first one, until the store works again."""
         if self._store_reachable:
             _log.warning(
                 "sessions are not saved and can't be resumed elsewhere: %s", error, extra={"event": "store_lost"}
             )
         self._store_reachable = False
+        self._store_failed_at = self._clock()
         if self._on_store_failure is not None:
             self._on_store_failure()
 
     def _note_success(self) -> None:
-        if not self._store_reachable:
-            _log.info("sessions are saved again", extra={"event": "store_restored"})
+        if self._store_reachable or self._clock() - self._store_failed_at < _RESTORED_AFTER_S:
+            return
+        _log.info("sessions are saved again", extra={"event": "store_restored"})
         self._store_reachable = True
 
 

@@ -63,8 +63,8 @@ class SessionStore(Protocol):
         """Deletes the session if `owner` still owns it."""
         ...
 
-    async def ping(self) -> None:
-        """Checks that the store can be reached."""
+    async def check(self) -> None:
+        """Checks that the store can be reached and that it accepts sessions."""
         ...
 
     async def close(self) -> None:
@@ -114,7 +114,7 @@ class MemoryStore:
         if self.owner(key) == owner:
             self._remove(key)
 
-    async def ping(self) -> None:
+    async def check(self) -> None:
         """Returns: memory can always be reached."""
 
     async def close(self) -> None:

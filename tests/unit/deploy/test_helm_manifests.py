@@ -33,7 +33,7 @@ from lanestream.settings import Settings, load_settings
 # The oldest version of Kubernetes that the chart accepts, and the newest one with known schemas.
 KUBERNETES = ("1.30", "1.37")
 # Their schemas are not part of Kubernetes.
-CUSTOM_KINDS = {"ServiceMonitor", "PrometheusRule", "ScaledObject"}
+CUSTOM_KINDS = {"ServiceMonitor", "PrometheusRule", "ScaledObject", "HTTPRoute"}
 OTHER_VARIABLES = {
     "FORWARDED_ALLOW_IPS",
     "OTEL_EXPORTER_OTLP_ENDPOINT",
@@ -70,6 +70,7 @@ def test_kinds_depend_on_the_values(variant: str) -> None:
     kinds = {manifest["kind"] for manifest in manifests(variant)}
     assert {"Deployment", "Service", "ServiceAccount", "PodDisruptionBudget"} <= kinds
     assert ("Ingress" in kinds) == (variant in ("ingress", "everything"))
+    assert ("HTTPRoute" in kinds) == (variant == "gateway")
     assert ("HorizontalPodAutoscaler" in kinds) == (variant == "hpa")
     assert ("ScaledObject" in kinds) == (variant == "keda")
     assert ("PrometheusRule" in kinds) == (variant in ("hpa", "keda"))

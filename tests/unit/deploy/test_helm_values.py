@@ -10,7 +10,7 @@ from typing import Any
 import chart
 import pytest
 import yaml
-from helmchart import BASE, CHART, ENTRY, PAGE, SCRAPED, VALUES, documented, rendered, run_helm
+from helmchart import BASE, CHART, ENTRY, GATEWAY, PAGE, SCRAPED, VALUES, documented, rendered, run_helm
 
 
 def test_generated_files_are_up_to_date() -> None:
@@ -30,6 +30,8 @@ def test_generated_files_are_up_to_date() -> None:
         ({"networkPolicy": {"from": []}}, "at '/networkPolicy/from'"),
         ({"ingress": {"enabled": True, "tlsSecret": "tls"}}, "ingress.host is missing"),
         ({"ingress": {"enabled": True, "host": "lanes.example.com"}}, "ingress.tlsSecret is missing"),
+        ({"gateway": {"enabled": True, "host": "lanes.example.com"}}, "gateway.parentRefs is missing"),
+        ({"gateway": {**GATEWAY, "host": ""}}, "gateway.host is missing"),
         ({"metrics": {"serviceMonitor": {"enabled": True}}}, "keySecret.name is missing"),
         ({"metrics": SCRAPED, "settings": {"metrics_access": "off"}}, "settings.metrics_access is off"),
         ({"autoscaling": {"kind": "keda"}}, "autoscaling.prometheusUrl is missing"),

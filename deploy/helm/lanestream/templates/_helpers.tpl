@@ -15,6 +15,11 @@
 {{ include "lanestream.name" . }}-redis
 {{- end }}
 
+{{/* The prefixes of all paths but `/`, which is exact, and `/metrics`, which stays inside the cluster. */}}
+{{- define "lanestream.publicPrefixes" -}}
+["/v1", "/static", "/docs", "/swagger", "/openapi.json", "/healthz", "/readyz"]
+{{- end }}
+
 {{/* The labels that select pods. They take a list: the root and a component, `service` or `redis`. */}}
 {{- define "lanestream.selectorLabels" -}}
 {{- $root := index . 0 -}}

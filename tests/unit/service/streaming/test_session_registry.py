@@ -74,7 +74,7 @@ class UnreachableStore(MemoryStore):
         self._check()
         return await super().save(key, session, ttl_s)
 
-    async def ping(self) -> None:
+    async def check(self) -> None:
         self._check()
 
 
@@ -115,6 +115,8 @@ def make_registry(
 async def replicas(number: int, store: SessionStore) -> AsyncIterator[list[SessionRegistry]]:
     """Yields registries that share a store."""
     registries = [make_registry(store) for _ in range(number)]
+    for registry in registries:
+        registry.begin()
     try:
         yield registries
     finally:
@@ -427,15 +429,28 @@ async def test_sessions_work_without_a_reachable_store(caplog: pytest.LogCapture
     assert len([record for record in caplog.records if "not saved" in record.message]) == 1
 
 
-async def test_failures_of_the_store_are_reported() -> None:
-    store, failures = UnreachableStore(), []
-    registry = SessionRegistry(SessionLimits(), store, on_store_failure=lambda: failures.append(None))
+async def test_failures_of_the_store_are_reported(caplog: pytest.LogCaptureFixture) -> None:
+    store, failures, clock = UnreachableStore(), [], Clock()
+    registry = SessionRegistry(SessionLimits(), store, clock=clock, on_store_failure=lambda: failures.append(None))
     assert registry.store_reachable
     first = await start(registry)
     assert (registry.store_reachable, len(failures)) == (False, 1)
     store.works = True
+    clock.now += 2.1
     await registry.close(first, resumable=True)
     assert (registry.store_reachable, len(failures)) == (True, 1)
+    assert [getattr(record, "event", None) for record in caplog.records] == ["store_lost"]
+
+
+async def test_a_store_that_fails_now_and_then_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    store, clock = UnreachableStore(), Clock()
+    registry = SessionRegistry(SessionLimits(), store, clock=clock)
+    for i in range(100):
+        store.works = i % 2 == 1
+        await registry.close(await start(registry), resumable=True)
+        clock.now += 0.25
+        assert not registry.store_reachable
+    assert [getattr(record, "event", None) for record in caplog.records] == ["store_lost"]
 
 
 async def test_an_incompatible_record_starts_a_new_session() -> None:
@@ -581,17 +596,22 @@ async def test_open_sessions_are_saved_again_in_a_shared_store_that_lost_them() 
         assert (await start(other, token=first.token)).resumed
 
 
-async def test_a_shared_store_is_tested_without_sessions() -> None:
+async def test_a_shared_store_is_checked_without_sessions() -> None:
     class BrokenStore(UnreachableStore, SharedStore):
         pass
 
-    store = BrokenStore()
-    async with replicas(1, store) as (registry,):
-        await registry.close(await start(registry), resumable=False)
-        assert not registry.store_reachable
+    store, machine = BrokenStore(), Machine()
+    registry = make_registry(store, machine)
+    registry.begin()
+    try:
+        await asyncio.sleep(0.1)
+        assert not registry.store_reachable, "the store is checked at once, before the first stream"
         store.works = True
+        machine.advance(2.1)
         await asyncio.sleep(1.3)
         assert registry.store_reachable
+    finally:
+        await registry.stop()
 
 
 async def test_sessions_are_limited_in_rate_per_caller() -> None:

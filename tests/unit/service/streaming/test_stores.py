@@ -87,7 +87,7 @@ async def test_sessions_expire(store: SessionStore, key: str) -> None:
 
 
 async def test_a_reachable_store_answers(store: SessionStore) -> None:
-    await store.ping()
+    await store.check()
     assert (store.name, store.shared) in (("memory", False), ("redis", True))
 
 
@@ -147,7 +147,7 @@ async def test_an_unreachable_redis_is_reported() -> None:
         for operation in (
             store.save("key", session("ann", "one", b"a"), 1.0),
             store.delete("key", "one"),
-            store.ping(),
+            store.check(),
         ):
             with pytest.raises(StoreError, match="failed a moment ago"):
                 await operation
@@ -293,4 +293,4 @@ async def test_a_redis_that_refuses_is_asked_again(tmp_path: Path, key: str) -> 
             for _ in range(2):
                 with pytest.raises(StoreError, match="WRONGTYPE"):
                     await store.save(key, session("ann", "a", b"1"), 60.0)
-            await store.ping()
+            await store.check()
