@@ -7,7 +7,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+
+import psutil
 
 
 @contextmanager
@@ -31,3 +33,13 @@ def service(port: int = 0, **settings: object) -> Iterator[tuple[subprocess.Pope
             yield process, url
         finally:
             process.kill()
+
+
+def commands_of_run(value: str) -> list[str]:
+    """Returns the commands of all processes whose TEST_RUN is `value`, even if their parent has ended."""
+    commands = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            if process.environ().get("TEST_RUN") == value:
+                commands.append(" ".join(process.cmdline()))
+    return commands
