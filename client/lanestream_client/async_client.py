@@ -34,6 +34,7 @@ from lanestream_client.endpoint import (
     http_errors,
     http_options,
     parse_endpoints,
+    stream_errors,
     websocket_errors,
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
@@ -214,19 +215,20 @@ class AsyncLaneStream:
         protocol, failover, timeout = self._protocol, self._failover, self._failover.timeout_s
         with websocket_errors(failover.endpoint):
             async with connect(**connect_options(failover.endpoint, timeout)) as socket:
-                await socket.send(protocol.start_message())
-                answer = await asyncio.wait_for(socket.recv(), max(timeout, READY_TIMEOUT_S))
-                results = await tasks.locked(partial(protocol.receive_ready, answer))
-                failover.connected()
-                async with tasks.sending_to(socket):
-                    for result in results:
-                        yield result
-                    while protocol.summary is None:
-                        results = await tasks.locked(partial(protocol.receive, await socket.recv()))
-                        if results:
-                            failover.progressed()
+                with stream_errors(socket.response):
+                    await socket.send(protocol.start_message())
+                    answer = await asyncio.wait_for(socket.recv(), max(timeout, READY_TIMEOUT_S))
+                    results = await tasks.locked(partial(protocol.receive_ready, answer))
+                    failover.connected()
+                    async with tasks.sending_to(socket):
                         for result in results:
                             yield result
+                        while protocol.summary is None:
+                            results = await tasks.locked(partial(protocol.receive, await socket.recv()))
+                            if results:
+                                failover.progressed()
+                            for result in results:
+                                yield result
 
     async def _handle_failure(self, failure: LanestreamError, tasks: _StreamTasks) -> AsyncGenerator[StreamResult]:
         """Yields the results that were lost and waits for the next attempt. Raises `failure` if there is none."""

@@ -35,6 +35,7 @@ from lanestream_client.endpoint import (
     http_errors,
     http_options,
     parse_endpoints,
+    stream_errors,
     websocket_errors,
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
@@ -216,6 +217,7 @@ class LaneStream:
         with (
             websocket_errors(failover.endpoint),
             connect(**connect_options(failover.endpoint, timeout)) as socket,
+            stream_errors(socket.response),
         ):
             socket.send(protocol.start_message())
             answer = socket.recv(max(timeout, READY_TIMEOUT_S))

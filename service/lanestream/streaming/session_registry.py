@@ -10,6 +10,7 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
+from contextvars import Context
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -230,7 +231,8 @@ class SessionRegistry:
         others, BusyError at a limit, and NoDetectorError if the requested detector is not loaded.
         """
         if self._store.shared and self._renewal is None:
-            self._renewal = asyncio.create_task(self._renew())
+            # Outside of the request that happens to be the first: its log records are about all sessions.
+            self._renewal = asyncio.create_task(self._renew(), context=Context())
         if message.resume_token is None:
             session = self.open(pool, caller, options, message.session)
             return await self._begin(session, _Turn())

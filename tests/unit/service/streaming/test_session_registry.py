@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from lanestream.errors import BusyError, EvictedError, NoDetectorError, StoreError, TooOldError
 from lanestream.images.decoding import ImageLimits
+from lanestream.logs import request_fields
 from lanestream.messages import ProcessedFrame, lanes_message
 from lanestream.protocol import StartMessage
 from lanestream.road.results import FrameResult
@@ -582,16 +583,22 @@ async def test_open_sessions_are_saved_again_in_a_shared_store_that_lost_them() 
 
 
 async def test_a_shared_store_is_tested_without_sessions() -> None:
+    fields = []
+
     class BrokenStore(UnreachableStore, SharedStore):
-        pass
+        async def ping(self) -> None:
+            fields.append(request_fields.get())
+            await super().ping()
 
     store = BrokenStore()
+    request_fields.set({"request_id": "the first request"})
     async with replicas(1, store) as (registry,):
         await registry.close(await start(registry), resumable=False)
         assert not registry.store_reachable
         store.works = True
         await asyncio.sleep(1.3)
         assert registry.store_reachable
+    assert fields == [{}], "the test belongs to no request"
 
 
 async def test_sessions_are_limited_in_rate_per_caller() -> None:
