@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Problem(BaseModel):
-    """The body of every error response. `request_id` is missing if the head of the request was refused."""
+    """The body of every error response. `request_id` is null if the head of the request was refused."""
 
     code: str
     message: str
@@ -67,7 +67,7 @@ async def _handle_http_error(request: Request, error: Exception) -> JSONResponse
 
 def raw_response(status: HTTPStatus, code: str, message: str, hint: str) -> bytes:
     """Returns an error response as bytes, for a connection that is closed before the application sees its request."""
-    body = Problem(code=code, message=message, hint=hint).model_dump_json(exclude_none=True).encode()
+    body = Problem(code=code, message=message, hint=hint).model_dump_json().encode()
     head = (
         f"HTTP/1.1 {status.value} {status.phrase}\r\n"
         f"content-type: application/json\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n"
