@@ -22,11 +22,14 @@ REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
 # Marks what the environment was set up for. It is set up again when pyproject.toml changes.
 RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
+# The environment with onnxruntime for GPUs, which can't be in the same one as that for CPUs.
+GPU_VENV := .venv-gpu
+GPU_READY := $(GPU_VENV)/.ready
 # The same for the packages of the JavaScript client; and its first compiled module.
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack batch-ray batch-speed bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up compose-ready down up-check clean js js-types
+.PHONY: attack batch-ray batch-speed bench gpu-check soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up compose-ready down up-check clean js js-types
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -122,6 +125,11 @@ ablation: $(DEV_READY)
 bench: $(DEV_READY)
 	PYTHONPATH=tools $(BIN)/python -m bench $(ARGS)
 
+# Checks and measures everything on an NVIDIA GPU, in minutes; continues after an interruption. ARGS='--provider cpu' runs
+# it without one.
+gpu-check: $(GPU_READY)
+	$(GPU_VENV)/bin/python tools/gpu_check.py $(ARGS)
+
 # Measures how much of what the processors could do `lanestream batch` does. ARGS='VIDEO...' instead of rendered ones.
 batch-speed: $(DEV_READY)
 	$(BIN)/python tools/batch_speed.py $(ARGS)
@@ -211,7 +219,7 @@ up-check: $(DEV_READY)
 	  $(if $(BUILD_OPTIONS),--build-options "$(BUILD_OPTIONS)")
 
 clean:
-	rm -rf $(VENV) client/js/node_modules client/js/dist out .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(GPU_VENV) client/js/node_modules client/js/dist out .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(VENV)/bin/python:
 	@"$(PYTHON)" $(NEW_ENOUGH) 2>/dev/null || \
@@ -225,6 +233,11 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,docs,dev]'
 	@touch $@ $(RUN_READY)
+
+$(GPU_READY): pyproject.toml
+	"$(PYTHON)" -m venv $(GPU_VENV)
+	$(GPU_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -e '.[gpu-check]'
+	@touch $@
 
 $(JS_READY): client/js/package-lock.json
 	@command -v npm >/dev/null || { echo "error: no npm (on Debian: apt install nodejs npm)" >&2; exit 1; }

@@ -25,6 +25,7 @@ from lanestream.errors import ProviderError
 from lanestream.inference.loaded_model import LoadedModel
 from lanestream.inference.loading import load_model
 from lanestream.inference.providers import PROVIDERS, RuntimeOptions
+from lanestream.road.view import Image
 from lanestream_exporter.scenes import render_still, sample_scene
 
 _FILES: Final = (SHIPPED_MODEL, SHIPPED_MODEL.with_name("classifier-fp32.onnx"), SHIPPED_REGRESSOR)
@@ -40,7 +41,8 @@ Inputs = NDArray[np.uint8]
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the numbers to this file, too.")
 def main(threads: int | None, rounds: int, json_file: Path | None) -> None:
     """Compare the available providers on the shipped networks."""
-    patches, crops = _inputs()
+    inputs_of = network_inputs(rendered_scenes())
+    patches, crops = inputs_of["classifier"], inputs_of["regressor"]
     table = Table("network", "provider", *map(str, _BATCHES), "mean difference", "max difference", box=box.SIMPLE)
     report = []
     for path in _FILES:
@@ -62,18 +64,24 @@ def main(threads: int | None, rounds: int, json_file: Path | None) -> None:
         json_file.write_text(json.dumps(report, indent=2))
 
 
-def _inputs() -> Sequence[Inputs]:
-    """Returns the inputs of the classifier and of the regressor for rendered roads."""
-    engine, rng = load_engine(provider="cpu"), np.random.default_rng(5)
+def rendered_scenes() -> list[Image]:
+    """Returns pictures of rendered roads."""
+    rng = np.random.default_rng(5)
+    return [render_still(sample_scene(rng, 640, 360)).image for _ in range(_SCENES)]
+
+
+def network_inputs(images: Sequence[Image]) -> Mapping[ModelRole, Inputs]:
+    """Returns what the classifier and the regressor get for `images`, of which each is the first of a session."""
+    engine = load_engine(provider="cpu")
     inputs: dict[ModelRole, list[Inputs]] = {"classifier": [], "regressor": []}
 
     def infer(role: ModelRole, batch: Inputs) -> NDArray[np.float32]:
         inputs[role].append(batch)
         return engine.models[role].run(batch)
 
-    for _ in range(_SCENES):
-        engine.open_session().process(render_still(sample_scene(rng, 640, 360)).image, 0.0, infer)
-    return [np.concatenate(batches) for batches in inputs.values()]
+    for image in images:
+        engine.open_session().process(image, 0.0, infer)
+    return {role: np.concatenate(batches) for role, batches in inputs.items()}
 
 
 def _networks(path: Path, options: RuntimeOptions) -> Mapping[str, LoadedModel]:

@@ -35,6 +35,7 @@ from lanestream_client.endpoint import (
     http_errors,
     http_options,
     parse_endpoints,
+    stream_errors,
     websocket_errors,
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
@@ -217,19 +218,20 @@ class AsyncLaneStream:
             with handshake_errors(failover.endpoint):
                 connection = await connect(**connect_options(failover.endpoint, timeout))
             async with connection as socket:
-                await socket.send(protocol.start_message())
-                answer = await asyncio.wait_for(socket.recv(), max(timeout, READY_TIMEOUT_S))
-                results = await tasks.locked(partial(protocol.receive_ready, answer))
-                failover.connected()
-                async with tasks.sending_to(socket):
-                    for result in results:
-                        yield result
-                    while protocol.summary is None:
-                        results = await tasks.locked(partial(protocol.receive, await socket.recv()))
-                        if results:
-                            failover.progressed()
+                with stream_errors(socket.response):
+                    await socket.send(protocol.start_message())
+                    answer = await asyncio.wait_for(socket.recv(), max(timeout, READY_TIMEOUT_S))
+                    results = await tasks.locked(partial(protocol.receive_ready, answer))
+                    failover.connected()
+                    async with tasks.sending_to(socket):
                         for result in results:
                             yield result
+                        while protocol.summary is None:
+                            results = await tasks.locked(partial(protocol.receive, await socket.recv()))
+                            if results:
+                                failover.progressed()
+                            for result in results:
+                                yield result
 
     async def _handle_failure(self, failure: LanestreamError, tasks: _StreamTasks) -> AsyncGenerator[StreamResult]:
         """Yields the results that were lost and waits for the next attempt. Raises `failure` if there is none."""

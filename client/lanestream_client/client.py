@@ -36,6 +36,7 @@ from lanestream_client.endpoint import (
     http_errors,
     http_options,
     parse_endpoints,
+    stream_errors,
     websocket_errors,
 )
 from lanestream_client.failover import RETRYABLE, FailoverPolicy, RetryPolicy
@@ -217,7 +218,7 @@ class LaneStream:
         with websocket_errors(failover.endpoint):
             with handshake_errors(failover.endpoint):
                 connection = connect(**connect_options(failover.endpoint, timeout))
-            with connection as socket:
+            with connection as socket, stream_errors(socket.response):
                 socket.send(protocol.start_message())
                 answer = socket.recv(max(timeout, READY_TIMEOUT_S))
                 results = threads.locked(partial(protocol.receive_ready, answer))

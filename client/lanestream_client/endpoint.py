@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 
 import httpx
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.http11 import Response
 from websockets.typing import Subprotocol
 
 from lanestream.errors import (
@@ -63,6 +64,8 @@ _CLOSE_CODE_ERRORS: Final[Mapping[int, type[LanestreamError]]] = {
     4003: TooOldError,
 }
 _MESSAGE_TOO_BIG: Final = 1009
+_REQUEST_ID_HEADER: Final = "X-Request-ID"
+_MOST_ID_CHARACTERS: Final = 128
 
 Transport = TypeVar("Transport", httpx.BaseTransport, httpx.AsyncBaseTransport)
 
@@ -177,6 +180,17 @@ def handshake_errors(endpoint: Endpoint) -> Iterator[None]:
 
 
 @contextmanager
+def stream_errors(response: Response | None) -> Iterator[None]:
+    """Adds the request id in the response to a handshake to the errors of its stream in the block."""
+    try:
+        yield
+    except (ConnectionClosed, LanestreamError) as raised:
+        error = closed_error(raised) if isinstance(raised, ConnectionClosed) else raised
+        error.request_id = _shown_id(None if response is None else response.headers.get(_REQUEST_ID_HEADER))
+        raise error from None
+
+
+@contextmanager
 def http_errors(endpoint: Endpoint) -> Iterator[None]:
     """Converts httpx's exceptions in the block to ConnectionFailedErrors."""
     try:
@@ -201,7 +215,9 @@ def refusal_error(status: int, body: bytes | bytearray, endpoint: Endpoint) -> L
     """Returns the error in an unsuccessful response, or a ConnectionFailedError if it is not from Lanestream."""
     try:
         problem: dict[str, Any] = json.loads(body)
-        return error_from_code(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
+        error = error_from_code(str(problem["code"]), str(problem["message"]), str(problem["hint"]))
+        error.request_id = _shown_id(problem.get("request_id"))
+        return error
     except (ValueError, TypeError, KeyError):
         answer = f"{endpoint.base} answered {status} {responses.get(status, '')}".rstrip()
     if endpoint.proxy is not None:
@@ -224,6 +240,11 @@ def _unreachable_error(endpoint: Endpoint, error: BaseException) -> ConnectionFa
         hint = "check that a service runs there, and whether it asks for a certificate (--client-certificate)"
         return ConnectionFailedError(f"{failure}: {reason}", hint)
     return ConnectionFailedError(f"{failure}: {reason}", "start one with `lanestream serve`")
+
+
+def _shown_id(request_id: object) -> str | None:
+    """Returns a request id from the service or a proxy for a message; None if there is none."""
+    return one_line(request_id, _MOST_ID_CHARACTERS) if isinstance(request_id, str) and request_id else None
 
 
 def _headers(api_key: str | None) -> dict[str, str]:

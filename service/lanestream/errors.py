@@ -16,10 +16,12 @@ from lanestream.packages import broken_module
 class LanestreamError(Exception):
     """The root of all errors that Lanestream raises on purpose.
 
-    `code` is stable and meant for programs. `message` says what was wrong, `hint` what is accepted or what to do.
+    `code` is stable and meant for programs. `message` says what was wrong, `hint` what is accepted or what to do. In a
+    client, `request_id` is what the log of the service calls the request or stream that failed; None if unknown.
     """
 
     code: str = "internal"
+    request_id: str | None = None
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message)
@@ -27,7 +29,8 @@ class LanestreamError(Exception):
         self.hint = hint
 
     def __str__(self) -> str:
-        return f"{self.message} ({self.hint})" if self.hint else self.message
+        request = f" [request {self.request_id}]" if self.request_id else ""
+        return (f"{self.message} ({self.hint})" if self.hint else self.message) + request
 
 
 class ImageError(LanestreamError):

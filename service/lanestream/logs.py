@@ -1,8 +1,8 @@
 """The service's logging: one handler for all loggers, as text or JSON lines, without secrets.
 
 Logging never waits for whoever reads standard error: see BackgroundHandler. Records about a session or a frame name it
-with `extra={"session": ..., "seq": ...}`. Records that programs may look for also have an `event` and its values there:
-they are fields in JSON, and the message says the same to people.
+with `extra={"session": ..., "seq": ...}`; those of a request have its `request_fields`, too. Records that programs may
+look for also have an `event` and its values there: they are fields in JSON, and the message says the same to people.
 """
 
 from __future__ import annotations
@@ -14,8 +14,11 @@ import stat
 import sys
 import threading
 from collections import deque
+from collections.abc import Mapping
 from contextlib import suppress
+from contextvars import ContextVar
 from http import HTTPStatus
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from pythonjsonlogger.core import RESERVED_ATTRS
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
 
 _NAMES: Final = {"levelname": "level", "name": "logger", "exc_info": "exception", "stack_info": "stack"}
 _TIME: Final = "time"
-_CONTEXT: Final = ("session", "seq")
+_CONTEXT: Final = ("session", "seq", "request_id", "trace_id")
 # Fields that libraries add to their records for their own formatters.
 _LIBRARY_FIELDS: Final = ("color_message", "websocket")
 # uvicorn's access log. The arguments of its records are the address, method, path, HTTP version and status.
@@ -39,6 +42,9 @@ _QUEUE_BYTES: Final = 1 << 20
 # The lines of several processes stay whole in one pipe if no write is longer than this.
 _WRITE_BYTES: Final = select.PIPE_BUF
 _FLUSH_S: Final = 0.5
+
+# Fields of all records that are logged while a request or a stream is handled.
+request_fields: ContextVar[Mapping[str, str]] = ContextVar("request_fields", default=MappingProxyType({}))
 
 
 class BackgroundHandler(logging.Handler):
@@ -131,7 +137,7 @@ class BackgroundHandler(logging.Handler):
 
 
 class TextLogFormatter(logging.Formatter):
-    """Formats records as lines of text: time, level, logger, message, and the session and frame if there are any."""
+    """Formats records as lines of text: time, level, logger, message, and session, frame, request and trace if any."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
@@ -140,7 +146,7 @@ class TextLogFormatter(logging.Formatter):
         """Returns the record as one line, without its traceback."""
         context = {name: getattr(record, name, None) for name in _CONTEXT}
         pairs = [f" {name}={value}" for name, value in context.items() if value is not None]
-        return super().formatMessage(record) + "".join(pairs)
+        return super().formatMessage(record).rstrip() + "".join(pairs)
 
 
 class JsonLogFormatter(JsonFormatter):
@@ -165,6 +171,16 @@ class JsonLogFormatter(JsonFormatter):
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
         """Returns the record without empty fields."""
         return {name: value for name, value in log_data.items() if value is not None}
+
+
+class RequestFilter(logging.Filter):
+    """Adds the fields of the request or stream that is handled to a record, unless the record has its own."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Changes the record in place, and always keeps it."""
+        for name, value in request_fields.get().items():
+            record.__dict__.setdefault(name, value)
+        return True
 
 
 class QueryRemover(logging.Filter):
@@ -206,6 +222,7 @@ def log_config(settings: Settings) -> dict[str, Any]:
         "disable_existing_loggers": False,
         "formatters": {"lines": {"()": TextLogFormatter if settings.log_format == "text" else JsonLogFormatter}},
         "filters": {
+            "requests": {"()": RequestFilter},
             "queries": {"()": QueryRemover},
             "false_alarms": {"()": FalseAlarmFilter},
             "probes": {"()": ProbeFilter},
@@ -214,7 +231,7 @@ def log_config(settings: Settings) -> dict[str, Any]:
             "stderr": {
                 "()": BackgroundHandler,
                 "formatter": "lines",
-                "filters": ["queries", "false_alarms", "probes"],
+                "filters": ["requests", "queries", "false_alarms", "probes"],
             },
         },
         "root": {"handlers": ["stderr"], "level": "WARNING"},

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -17,6 +15,7 @@ import httpx
 import jwt
 import pytest
 from fastapi.routing import APIRoute
+from processes import log_lines
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from wsclient import wait_until_released
@@ -60,7 +59,7 @@ def refused_handshake(url: str, **options: Any) -> tuple[int, str, str | None]:
         send_frame(url, **options)
     response = caught.value.response
     problem = json.loads(response.body)
-    assert set(problem) == {"code", "message", "hint"}
+    assert set(problem) == {"code", "message", "hint", "request_id"}
     return response.status_code, problem["code"], response.headers.get("www-authenticate")
 
 
@@ -387,31 +386,6 @@ def test_a_forwarded_address_counts_only_if_it_comes_from_a_trusted_proxy(
 @pytest.mark.parametrize("path", ["/redoc", "/docs/oauth2-redirect/../redoc"])
 def test_no_page_loads_scripts_from_elsewhere(url: str, path: str) -> None:
     assert httpx.get(url + path).status_code == 404
-
-
-def log_lines(arguments: list[str], settings: dict[str, str], use: Callable[[str], None]) -> list[str]:
-    """Returns the lines that `lanestream serve` logs while `use` is called with its URL."""
-    command = [sys.executable, "-m", "lanestream.cli", "serve", "--port", "0", "--provider", "cpu", *arguments]
-    environment = {**os.environ, **settings}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        assert process.stderr is not None
-        lines: list[str] = []
-        try:
-            for line in process.stderr:
-                lines.append(line)
-                if "listening on" in line:
-                    url = line.split("listening on ")[1].split(",")[0]
-                if '"ready"' in line or line.endswith(": ready\n"):
-                    break
-            use(url.replace("0.0.0.0", "127.0.0.1"))  # noqa: S104
-            process.send_signal(signal.SIGINT)
-            output, errors = process.communicate(timeout=fakes.WAIT_S)
-        finally:
-            process.kill()
-    assert output == ""
-    return [*lines, *errors.splitlines(keepends=True)]
 
 
 def test_keys_are_never_logged() -> None:

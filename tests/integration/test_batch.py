@@ -293,9 +293,9 @@ def test_an_unknown_provider_is_reported_in_one_line(archive: Path, tmp_path: Pa
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with 200 tiny videos."""
+    """A folder with 80 tiny videos."""
     folder = tmp_path_factory.mktemp("clips")
-    for number in range(200):
+    for number in range(80):
         if number < 4:
             write_clip(folder / f"{number}.mp4", 1 + number % 2)
         else:
@@ -307,7 +307,7 @@ def test_a_batch_that_is_killed_again_and_again_misses_nothing(clips: Path, tmp_
     whole = Batch(clips, "--out", tmp_path / "whole").finish()
     assert whole[0] == 0, whole
     out = tmp_path / "out"
-    for done, more_s in ((0, 0.3), (1, 0.0), (50, 0.011), (90, 0.023), (140, 0.002)):
+    for done, more_s in ((0, 0.3), (1, 0.0), (20, 0.011), (40, 0.023), (60, 0.002)):
         killed = Batch(clips, "--out", out)
         killed.wait_for_files(out, done)
         time.sleep(more_s)
@@ -315,9 +315,9 @@ def test_a_batch_that_is_killed_again_and_again_misses_nothing(clips: Path, tmp_
         assert killed.finish()[0] == -signal.SIGKILL
     code, _, errors = Batch(clips, "--out", out).finish()
     assert code == 0
-    assert "of 200 files were processed before" in errors
+    assert "of 80 files were processed before" in errors
     found = rows(out)
-    assert len(found) == 300
+    assert len(found) == 120
     assert found == rows(tmp_path / "whole")
     assert not list(out.glob("*/.*"))
     assert summary(out)["all_runs"] == summary(tmp_path / "whole")["all_runs"]

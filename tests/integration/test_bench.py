@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from pathlib import Path
 
-import psutil
 import pytest
 from bench.__main__ import main, measure
 from bench.report import HEADLINES
 from bench.runners import litserve_installed
 from bench.workload import LARGE, LITSERVE, RUNNERS, Suite
 from click.testing import CliRunner
+from processes import commands_of_run
 
 SUITE = Suite(
     rounds=1,
@@ -24,16 +23,6 @@ SUITE = Suite(
     overload_clients=(2,),
     soak_minutes=0.01,
 )
-
-
-def commands_of_run(value: str) -> list[str]:
-    """Returns the commands of all processes whose TEST_RUN is `value`, even if their parent has ended."""
-    commands = []
-    for process in psutil.process_iter():
-        with suppress(psutil.Error):
-            if process.environ().get("TEST_RUN") == value:
-                commands.append(" ".join(process.cmdline()))
-    return commands
 
 
 def test_all_runners_reply_and_no_process_is_left(

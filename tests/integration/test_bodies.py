@@ -41,7 +41,7 @@ def read_problem(connection: socket.socket) -> tuple[int, str]:
         status, head, body = read_response(connection)
     assert b"connection: close" in head
     problem = json.loads(body)
-    assert set(problem) == {"code", "message", "hint"}
+    assert set(problem) == {"code", "message", "hint", "request_id"}
     return status, problem["code"]
 
 

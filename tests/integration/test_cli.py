@@ -309,10 +309,12 @@ def test_the_detector_can_be_chosen(
 
 def test_a_detector_that_is_not_loaded_is_reported_in_one_line(run: Run, clip: Path, url: str) -> None:
     Path("a.jpg").write_bytes(fakes.image_file())
-    message = "error: there is no detector regression here (ask for candidates)\n"
-    for where in (["--url", url], ["--regressor", "none"]):
+    message = r"error: there is no detector regression here \(ask for candidates\)"
+    for where, end in ((["--url", url], r" \[request [0-9a-f]{16}\]\n"), (["--regressor", "none"], "\n")):
         for command in (["stream", clip], ["detect", "a.jpg"]):
-            assert run(*command, "--detector", "regression", *where) == (1, "", message)
+            code, output, errors = run(*command, "--detector", "regression", *where)
+            assert (code, output) == (1, "")
+            assert re.fullmatch(message + end, errors)
 
 
 def test_stream_of_a_folder_names_files_and_continues_after_a_bad_one(run: Run, tmp_path: Path) -> None:

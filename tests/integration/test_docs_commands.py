@@ -71,6 +71,8 @@ NOT_RUN = [
     ("docs/operations.md", "curl -X POST *", "needs a service with keys; tests/integration/test_access.py"),
     ("docs/operations.md", "new WebSocket(*", "one line of a web page; tests/integration/test_access.py"),
     ("docs/protocol.md", "new WebSocket(*", "one line of a web page; tests/integration/test_access.py"),
+    ("docs/providers.md", "make gpu-check*", "needs an NVIDIA GPU; tests/integration/test_gpu_check.py"),
+    ("docs/providers.md", "python tools/gpu_check.py*", "needs an NVIDIA GPU; tests/integration/test_gpu_check.py"),
     ("docs/quickstart.md", "lanestream stream 0 *", "needs a camera; tests/integration/test_network_cameras.py"),
     ("docs/security.md", "make attack*", f"{LONG}; tests/integration/test_attacks.py runs a part"),
     ("docs/training.md", "* classifier-finetune*", f"{LONG}; the same commands run with classifier-trial"),

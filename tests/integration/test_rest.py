@@ -12,6 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
+from lanestream.logs import flush_logs
 from lanestream.protocol import LanesMessage, parse_server_message
 
 Serve = Callable[..., str]
@@ -24,7 +25,7 @@ def detect(url: str, content: bytes | Iterator[bytes], **options: object) -> htt
 def problem(response: httpx.Response) -> tuple[int, str]:
     """Returns the status and code of an error response."""
     body = response.json()
-    assert set(body) == {"code", "message", "hint"}
+    assert set(body) == {"code", "message", "hint", "request_id"}
     assert "\n" not in body["message"]
     return response.status_code, body["code"]
 
@@ -159,10 +160,16 @@ def test_a_request_without_query_fields_accepts_none(url: str) -> None:
     assert httpx.get(f"{url}/healthz?from=balancer").status_code == 200
 
 
-def test_unexpected_errors_reveal_no_details(url: str) -> None:
+def test_unexpected_errors_reveal_no_details(url: str, capfd: pytest.CaptureFixture[str]) -> None:
     response = detect(url, fakes.image_file(shade=255))
     assert problem(response) == (500, "internal")
     assert "mistake" not in response.text
+    flush_logs()
+    request = response.headers["X-Request-ID"]
+    assert response.json()["request_id"] == request
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.endswith(f"request_id={request}")]
+    assert len(lines) == 2, "one of the response and one of its cause"
+    assert "Exception in ASGI application" in "".join(lines)
 
 
 def test_unknown_paths_and_methods_are_refused_with_a_problem(url: str) -> None:

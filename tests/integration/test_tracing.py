@@ -19,6 +19,8 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.proto.trace.v1.trace_pb2 import Span
 from websockets.sync.client import connect
 
+from lanestream.logs import flush_logs
+
 Serve = Callable[..., str]
 TRACE = "4bf92f3577b34da6a3ce929d0e0e4736"
 
@@ -114,12 +116,35 @@ def test_each_frame_of_a_stream_has_a_span_with_its_stages(serve: Serve, collect
     assert (_attributes(bad)["error.type"], bad.status.code) == ("bad_image", bad.status.STATUS_CODE_ERROR)
 
 
-def test_an_image_belongs_to_the_trace_of_its_request(serve: Serve, collector: Collector) -> None:
+def test_an_image_belongs_to_the_trace_of_its_request(
+    serve: Serve, collector: Collector, capfd: pytest.CaptureFixture[str]
+) -> None:
     headers = {"traceparent": f"00-{TRACE}-00f067aa0ba902b7-01"}
     response = httpx.post(f"{serve(fakes.engine())}/v1/detect", content=fakes.image_file(), headers=headers)
     assert response.status_code == 200
     (span,) = collector.wait_for(1)
     assert (span.trace_id.hex(), span.parent_span_id.hex()) == (TRACE, "00f067aa0ba902b7")
+    request = response.headers["X-Request-ID"]
+    assert _attributes(span)["lanestream.request_id"] == request
+    flush_logs()
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "/v1/detect" in line]
+    assert line.endswith(f" request_id={request} trace_id={TRACE}")
+
+
+def test_records_about_a_frame_name_its_trace(
+    serve: Serve, collector: Collector, capfd: pytest.CaptureFixture[str]
+) -> None:
+    url = serve(fakes.engine())
+    with connect(f"{url.replace('http', 'ws')}/v1/stream", compression=None) as socket:
+        socket.send(fakes.image_file(shade=255))
+        assert json.loads(socket.recv(fakes.WAIT_S))["code"] == "internal"
+        assert socket.response is not None
+        request = socket.response.headers["X-Request-ID"]
+    (span,) = collector.wait_for(1)
+    assert _attributes(span)["lanestream.request_id"] == request
+    flush_logs()
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "frame failed" in line]
+    assert line.endswith(f" seq=0 request_id={request} trace_id={span.trace_id.hex()}")
 
 
 def test_a_sampler_chooses_the_frames(serve: Serve, collector: Collector, monkeypatch: pytest.MonkeyPatch) -> None:

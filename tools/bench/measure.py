@@ -134,25 +134,38 @@ class Benchmark:
         self, processes: ProcessTree, parts: Sequence[tuple[HelperProcess, LoadRequest]], seconds: float
     ) -> Sample:
         generators = [ProcessTree(helper.pid) for helper, _ in parts if helper is not self._pipeline]
-        for helper, part in parts:
-            helper.start_load(part)
-        begun = time.monotonic()
-        settled = all(helper.wait_until_settled(begun + SETTLE_S - time.monotonic()) for helper, _ in parts)
-        seconds = max(seconds, MIN_CYCLES * (time.monotonic() - begun)) if settled else seconds
-        used, generated, started = processes.cpu_seconds(), _cpu_seconds(generators), time.monotonic()
-        time.sleep(seconds)
-        used, generated = processes.cpu_seconds() - used, _cpu_seconds(generators) - generated
-        ended, memory = time.monotonic(), processes.memory_mb()
-        results = [helper.stop_load() for helper, _ in parts]
-        replies = [
-            replace(reply, session=reply.session * len(results) + number)
-            for number, result in enumerate(results)
-            for reply in result.replies
-            if started <= reply.answered <= ended
-        ]
-        available_s = (ended - started) * len(os.sched_getaffinity(0))
-        failed = sum(result.failed for result in results)
-        return Sample(tuple(replies), failed, ended - started, used, memory, generated / available_s, settled)
+        return measure_load(processes, parts, generators, seconds)
+
+
+def measure_load(
+    processes: ProcessTree,
+    parts: Sequence[tuple[HelperProcess, LoadRequest]],
+    generators: Sequence[ProcessTree],
+    seconds: float,
+) -> Sample:
+    """Lets helper processes run their parts of a load on the runner `processes`, for some seconds once it has settled.
+
+    `generators` are those helpers that only generate load. Raises RuntimeError if a stream breaks.
+    """
+    for helper, part in parts:
+        helper.start_load(part)
+    begun = time.monotonic()
+    settled = all(helper.wait_until_settled(begun + SETTLE_S - time.monotonic()) for helper, _ in parts)
+    seconds = max(seconds, MIN_CYCLES * (time.monotonic() - begun)) if settled else seconds
+    used, generated, started = processes.cpu_seconds(), _cpu_seconds(generators), time.monotonic()
+    time.sleep(seconds)
+    used, generated = processes.cpu_seconds() - used, _cpu_seconds(generators) - generated
+    ended, memory = time.monotonic(), processes.memory_mb()
+    results = [helper.stop_load() for helper, _ in parts]
+    replies = [
+        replace(reply, session=reply.session * len(results) + number)
+        for number, result in enumerate(results)
+        for reply in result.replies
+        if started <= reply.answered <= ended
+    ]
+    available_s = (ended - started) * len(os.sched_getaffinity(0))
+    failed = sum(result.failed for result in results)
+    return Sample(tuple(replies), failed, ended - started, used, memory, generated / available_s, settled)
 
 
 def run_suite(bench: Benchmark, suite: Suite, say: Callable[[str], None]) -> Results:
@@ -195,13 +208,13 @@ def _describe(workload: Workload, sample: Sample) -> str:
 def benchmark(clips: Clips, provider: str, folder: Path) -> Iterator[Benchmark]:
     """Starts and warms up all runners and ends them afterwards. Their logs go to `folder`."""
     with ExitStack() as stack:
-        pipeline = _helper(stack, run_pipeline, clips, provider)
+        pipeline = start_helper(stack, run_pipeline, clips, provider)
         info: PipelineInfo = pipeline.wait_until_ready()
         processes = ProcessTree(pipeline.pid)
         # Its worker processes are suspended at the end, so they have to be killed with it.
         stack.callback(processes.end)
         processes.suspend()
-        generators = [_helper(stack, generate, clips) for _ in range(GENERATORS)]
+        generators = [start_helper(stack, generate, clips) for _ in range(GENERATORS)]
         for generator in generators:
             generator.wait_until_ready()
         servers = []
@@ -222,7 +235,8 @@ def split_load(request: LoadRequest, generators: Sequence[HelperProcess]) -> lis
     return [(helper, replace(request, sessions=count)) for helper, count in pairs if count]
 
 
-def _helper(stack: ExitStack, target: object, *arguments: object) -> HelperProcess:
+def start_helper(stack: ExitStack, target: object, *arguments: object) -> HelperProcess:
+    """Starts a helper process that runs `target(pipe, *arguments)`, and ends with `stack`."""
     # Spawned: after a fork, OpenCV or onnxruntime may wait for threads that exist in the parent only.
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()

@@ -6,9 +6,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -74,7 +74,10 @@ class ProcessTree:
 
 @dataclass(frozen=True)
 class ServerProgram:
-    """How to start a server, where it reports that it is ready, and where and how it takes frames."""
+    """How to start a server, where it reports that it is ready, and where and how it takes frames.
+
+    `environment` is added to that of this process.
+    """
 
     name: str
     transport: Transport
@@ -82,6 +85,7 @@ class ServerProgram:
     ready_path: str
     scheme: str
     path: str
+    environment: Mapping[str, str] = field(default_factory=dict)
 
 
 def server_programs(provider: str) -> list[ServerProgram]:
@@ -139,7 +143,7 @@ class Server:
         with self._log.open("a") as log:
             self._process = subprocess.Popen(
                 [*self._program.command, "--port", str(self._port)],
-                env={**os.environ, **_SETTINGS, "PYTHONPATH": os.pathsep.join(sys.path)},
+                env={**os.environ, **_SETTINGS, **self._program.environment, "PYTHONPATH": os.pathsep.join(sys.path)},
                 stdout=log,
                 stderr=log,
             )

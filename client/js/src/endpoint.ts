@@ -62,7 +62,8 @@ export function refusalError(status: number, body: string, endpoint: Endpoint): 
     const problem = JSON.parse(body) as Partial<Problem & { detail: string }>;
     const message = problem.message ?? problem.detail;
     if (typeof problem.code === "string" && typeof message === "string") {
-      return new LaneError(problem.code, message, String(problem.hint ?? ""), { httpStatus: status });
+      const details = { httpStatus: status, requestId: problem.request_id ?? null };
+      return new LaneError(problem.code, message, String(problem.hint ?? ""), details);
     }
   } catch {
     // Another server answered.

@@ -5,12 +5,13 @@ export interface ErrorDetails {
   seq?: number | null;
   fatal?: boolean;
   httpStatus?: number | null;
+  requestId?: string | null;
 }
 
 /**
  * Every error of this library. `code` is for programs; docs/protocol.md lists those of the service. `message` says what
  * was wrong, `hint` what is accepted or what to do. An error with a `seq` is about that frame only; a `fatal` one ended
- * the stream.
+ * the stream. `requestId` is what the log of the service calls a refused request.
  */
 export class LaneError extends Error {
   readonly code: string;
@@ -18,6 +19,7 @@ export class LaneError extends Error {
   readonly seq: number | null;
   readonly fatal: boolean;
   readonly httpStatus: number | null;
+  readonly requestId: string | null;
 
   constructor(code: string, message: string, hint = "", details: ErrorDetails = {}) {
     super(message);
@@ -27,6 +29,7 @@ export class LaneError extends Error {
     this.seq = details.seq ?? null;
     this.fatal = details.fatal ?? false;
     this.httpStatus = details.httpStatus ?? null;
+    this.requestId = details.requestId ?? null;
   }
 
   static fromMessage(message: ErrorMessage): LaneError {
@@ -40,7 +43,7 @@ export class LaneError extends Error {
 
   /** Returns this error as the one that ended the stream. */
   asFatal(): LaneError {
-    const details = { seq: this.seq, fatal: true, httpStatus: this.httpStatus };
+    const details = { seq: this.seq, fatal: true, httpStatus: this.httpStatus, requestId: this.requestId };
     return new LaneError(this.code, this.message, this.hint, details);
   }
 }

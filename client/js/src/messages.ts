@@ -707,10 +707,11 @@ export interface ModelEntry {
   };
 }
 /**
- * The body of every error response.
+ * The body of every error response. `request_id` is null if the head of the request was refused.
  */
 export interface Problem {
   code: string;
   message: string;
   hint: string;
+  request_id: string | null;
 }

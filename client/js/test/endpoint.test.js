@@ -67,9 +67,9 @@ test("a version of Node without WebSocket gets one clear line", (t) => {
 const [endpoint] = parseEndpoints("http://a");
 
 test("a refusal is the error that the service sent", () => {
-  const error = refusalError(401, '{"code": "unauthorized", "message": "no key", "hint": "send one"}', endpoint);
-  const { code, message, hint, httpStatus } = error;
-  assert.deepEqual([code, message, hint, httpStatus], ["unauthorized", "no key", "send one", 401]);
+  const error = refusalError(401, '{"code": "unauthorized", "message": "no key", "hint": "send one", "request_id": "3f9a"}', endpoint);
+  const { code, message, hint, httpStatus, requestId } = error;
+  assert.deepEqual([code, message, hint, httpStatus, requestId], ["unauthorized", "no key", "send one", 401, "3f9a"]);
 });
 
 for (const body of ["<html>", "{}", "null", '{"code": 3, "message": "x"}', ""]) {

@@ -13,10 +13,13 @@ from starlette.middleware.cors import CORSMiddleware
 from lanestream import __version__
 from lanestream.api import pages, rest, websocket
 from lanestream.api.problems import install_error_handlers
+from lanestream.api.request_id import REQUEST_ID_HEADER, RequestIds
 from lanestream.api.service import DrawLanes, Service
 from lanestream.workers.thread_pool import ThreadPool
 
 if TYPE_CHECKING:
+    from starlette.types import ASGIApp
+
     from lanestream.engine import Engine
     from lanestream.settings import Settings
 
@@ -39,7 +42,7 @@ def create_app(engine: Engine | None, settings: Settings, draw: DrawLanes | None
         yield
         await service.close()
 
-    app = FastAPI(
+    app = _Application(
         title="Lanestream",
         version=__version__,
         description="Camera frames in, tracked lane lines out. Streams of frames go to the WebSocket `/v1/stream`.",
@@ -55,10 +58,17 @@ def create_app(engine: Engine | None, settings: Settings, draw: DrawLanes | None
             CORSMiddleware,
             allow_origins=settings.allowed_origins,
             allow_methods=("GET", "POST"),
-            allow_headers=("Authorization",),
+            allow_headers=("Authorization", REQUEST_ID_HEADER),
+            expose_headers=(REQUEST_ID_HEADER,),
         )
     install_error_handlers(app)
     return app
+
+
+class _Application(FastAPI):
+    def build_middleware_stack(self) -> ASGIApp:
+        """Returns the application with all middleware: outermost the ids, which answers to unexpected errors need."""
+        return RequestIds(super().build_middleware_stack())
 
 
 def _include_routes(app: FastAPI, settings: Settings, *, with_keys: bool) -> None:

@@ -11,6 +11,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
+from lanestream.api.request_id import current_request_id
 from lanestream.errors import LanestreamError, ProtocolError, one_line, wire_status
 from lanestream.protocol import error_message
 
@@ -19,11 +20,12 @@ if TYPE_CHECKING:
 
 
 class Problem(BaseModel):
-    """The body of every error response."""
+    """The body of every error response. `request_id` is null if the head of the request was refused."""
 
     code: str
     message: str
     hint: str
+    request_id: str | None = None
 
 
 def install_error_handlers(app: FastAPI) -> None:
@@ -58,7 +60,7 @@ async def _handle_http_error(request: Request, error: Exception) -> JSONResponse
     request.app.state.service.metrics.refused(code)
     # The path as it was sent: a Host header can change the path that `request.url` returns.
     message = one_line(f"{request.method} {one_line(request.scope['path'], 80)}: {error.detail}")
-    response = _response(error.status_code, Problem(code=code, message=message, hint="see /docs"))
+    response = _response(error.status_code, code, message, "see /docs")
     response.headers.update(error.headers or {})
     return response
 
@@ -75,11 +77,10 @@ def raw_response(status: HTTPStatus, code: str, message: str, hint: str) -> byte
 
 def _error_response(error: Exception) -> JSONResponse:
     shown = error_message(error)
-    problem = Problem(code=shown.code, message=shown.message, hint=shown.hint)
-    return _response(wire_status(error).http_status, problem)
+    return _response(wire_status(error).http_status, shown.code, shown.message, shown.hint)
 
 
-def _response(status: int, problem: Problem) -> JSONResponse:
+def _response(status: int, code: str, message: str, hint: str) -> JSONResponse:
     """Returns the response with this status and body, and the headers that the status requires."""
     headers = {}
     if status in (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.REQUEST_TIMEOUT):
@@ -87,4 +88,5 @@ def _response(status: int, problem: Problem) -> JSONResponse:
         headers["connection"] = "close"
     if status == HTTPStatus.UNAUTHORIZED:
         headers["www-authenticate"] = "Bearer"
+    problem = Problem(code=code, message=message, hint=hint, request_id=current_request_id())
     return JSONResponse(problem.model_dump(), status, headers)

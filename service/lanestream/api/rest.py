@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from lanestream.api.metrics import MEDIA_TYPE
 from lanestream.api.problems import Problem
+from lanestream.api.request_id import add_trace, current_request_id
 from lanestream.api.service import Service
 from lanestream.errors import NotAcceptableError, ProtocolError, one_line
 from lanestream.images.decoding import decode
@@ -380,7 +381,7 @@ async def _process(
     service: Service, session: OpenSession, caller: Caller, data: bytes, request: Request
 ) -> ProcessedFrame:
     """Returns the lanes of an image. Counts and traces the frame, processed or failed."""
-    attributes = {"caller": caller.identity}
+    attributes = {"caller": caller.identity, "request_id": current_request_id()}
     service.metrics.frame_received()
     arrived = time.monotonic()
     image = EncodedFrame(data, 0.0, arrived, arrived + service.settings.body_s)
@@ -390,10 +391,10 @@ async def _process(
     except BaseException as error:
         service.metrics.frame_failed(error)
         if service.tracer is not None:
-            service.tracer.record(arrived, attributes, error=error, headers=request.headers)
+            add_trace(service.tracer.record(arrived, attributes, error=error, headers=request.headers))
         raise
     if service.tracer is not None:
-        service.tracer.record(arrived, attributes, frame.result.timing_ms, headers=request.headers)
+        add_trace(service.tracer.record(arrived, attributes, frame.result.timing_ms, headers=request.headers))
     service.metrics.frame_processed(frame.result.timing_ms, time.monotonic() - image.arrived)
     return frame
 

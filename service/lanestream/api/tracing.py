@@ -49,8 +49,8 @@ class FrameTracer:
         timing_ms: Mapping[str, float] | None = None,
         error: BaseException | None = None,
         headers: Mapping[str, str] | None = None,
-    ) -> None:
-        """Makes the span of a frame that has been answered or has failed.
+    ) -> str | None:
+        """Makes the span of a frame that has been answered or has failed. Returns its trace id if it is sampled.
 
         The span begins when the frame `arrived`, in monotonic seconds, and ends now. `timing_ms` are the stages in
         milliseconds. `headers` may carry a W3C `traceparent`, whose span is the parent then.
@@ -62,7 +62,8 @@ class FrameTracer:
             start_time=now - int((time.monotonic() - arrived) * _NANOSECONDS),
             attributes={f"{_NAME}.{name}": value for name, value in attributes.items()},
         )
-        if span.is_recording():
+        sampled = span.is_recording()
+        if sampled:
             for stage, duration in (timing_ms or {}).items():
                 span.set_attribute(f"{_NAME}.stage.{stage}_ms", duration)
             if error is not None:
@@ -70,6 +71,7 @@ class FrameTracer:
                 span.set_attribute("error.type", code)
                 span.set_status(self._failed)
         span.end(now)
+        return f"{span.get_span_context().trace_id:032x}" if sampled else None
 
     async def close(self) -> None:
         """Sends the spans that still wait, for at most two seconds."""

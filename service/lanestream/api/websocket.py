@@ -16,6 +16,7 @@ from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
 from lanestream.api.connections import connection_of
 from lanestream.api.problems import deny_handshake
+from lanestream.api.request_id import current_request_id
 from lanestream.errors import (
     BusyError,
     EvictedError,
@@ -266,18 +267,17 @@ class StreamConnection:
             # A frame is processed to its end even if the stream ends, so that the session's state stays consistent.
             processed = await asyncio.shield(self._work)
         except Exception as error:
+            trace_id = self._trace(session, frame, error=error)
             if not isinstance(error, LanestreamError):
-                _log.exception("frame failed", extra=self._log_fields("frame_failed", frame.seq))
+                _log.exception("frame failed", extra=self._log_fields("frame_failed", frame.seq, trace_id))
             self._service.metrics.frame_failed(error)
-            self._trace(session, frame, error=error)
             self._complete(session, FrameOutcome.EXPIRED if isinstance(error, ExpiredError) else FrameOutcome.FAILED)
             self._check_worker_losses(error)
             return error_message(error, seq=frame.seq)
         self._complete(session, FrameOutcome.ANSWERED)
         timing = processed.result.timing_ms
         self._service.metrics.frame_processed(timing, 1e-3 * timing["total"])
-        self._trace(session, frame, timing)
-        self._warn(processed.result.warnings, frame.seq)
+        self._warn(processed.result.warnings, frame.seq, self._trace(session, frame, timing))
         return lanes_message(
             processed,
             seq=frame.seq,
@@ -291,21 +291,25 @@ class StreamConnection:
         frame: IncomingFrame,
         timing_ms: Mapping[str, float] | None = None,
         error: Exception | None = None,
-    ) -> None:
+    ) -> str | None:
+        """Makes the span of a frame, if frames are traced. Returns its trace id if it is sampled."""
         tracer = self._service.tracer
-        if tracer is not None:
-            attributes: dict[str, str | int] = {
-                "session": session.id,
-                "seq": frame.seq,
-                "caller": self._caller.identity,
-            }
-            tracer.record(frame.arrived, attributes, timing_ms, error)
+        if tracer is None:
+            return None
+        attributes: dict[str, str | int] = {
+            "session": session.id,
+            "seq": frame.seq,
+            "caller": self._caller.identity,
+            "request_id": current_request_id(),
+        }
+        return tracer.record(frame.arrived, attributes, timing_ms, error)
 
-    def _warn(self, codes: Sequence[WarningCode], seq: int) -> None:
+    def _warn(self, codes: Sequence[WarningCode], seq: int, trace_id: str | None) -> None:
         for code in codes:
             self._protocol.warn(code, seq)
             self._service.metrics.timestamp_warning(code)
-            _log.warning("%s", WARNINGS[code][0], extra=self._log_fields("client_warning", seq) | {"code": code})
+            fields = self._log_fields("client_warning", seq, trace_id) | {"code": code}
+            _log.warning("%s", WARNINGS[code][0], extra=fields)
 
     def _check_worker_losses(self, error: Exception) -> None:
         """Raises the error, which ends the stream for good, if the stream's frames have cost several workers."""
@@ -433,6 +437,9 @@ class StreamConnection:
         finally:
             await releasing
 
-    def _log_fields(self, event: str, seq: int | None = None) -> dict[str, str | int | None]:
-        """Returns the fields that log records of this stream carry besides their message."""
-        return {"event": event, "session": None if self._session is None else self._session.id, "seq": seq}
+    def _log_fields(
+        self, event: str, seq: int | None = None, trace_id: str | None = None
+    ) -> dict[str, str | int | None]:
+        """Returns the fields that log records of this stream carry besides their message and the request's fields."""
+        session = None if self._session is None else self._session.id
+        return {"event": event, "session": session, "seq": seq, "trace_id": trace_id}

@@ -99,10 +99,22 @@ def verify_provider(spec: ProviderSpec, running: list[str]) -> None:
         )
 
 
+def session_options(threads: int | None) -> Any:
+    """Returns onnxruntime's options for every session; `threads` as in RuntimeOptions."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or processors()
+    # Only fatal errors: it raises all others, too, and they are reported once.
+    options.log_severity_level = 4
+    # Threads that spin while they wait take processor time from those that decode and search the next frame.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
+    return options
+
+
 def _cpu_session(path: Path, threads: int | None) -> Any:
     try:
         return onnxruntime.InferenceSession(
-            str(path), _session_options(threads), providers=[CPU.onnxruntime_name], enable_fallback=False
+            str(path), session_options(threads), providers=[CPU.onnxruntime_name], enable_fallback=False
         )
     except Exception as error:  # onnxruntime raises a type per status, all of them private
         raise ModelError(
@@ -118,24 +130,13 @@ def _gpu_session(path: Path, spec: ProviderSpec, options: RuntimeOptions) -> Any
     providers = [(each.onnxruntime_name, dict(each.options(info, options))) for each in dict.fromkeys((spec, CUDA))]
     try:
         return onnxruntime.InferenceSession(
-            str(path), _session_options(options.threads), providers=providers, enable_fallback=False
+            str(path), session_options(options.threads), providers=providers, enable_fallback=False
         )
     except Exception as error:
         raise ProviderError(
             f"{spec.name} does not work: {runtime_message(error)}",
             "check the driver and the libraries with `lanestream doctor`, or use the provider auto or cpu",
         ) from error
-
-
-def _session_options(threads: int | None) -> Any:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or processors()
-    # Only fatal errors: it raises all others, too, and they are reported once.
-    options.log_severity_level = 4
-    # Threads that spin while they wait take processor time from those that decode and search the next frame.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
-    return options
 
 
 def _info(session: Any, path: Path) -> ModelInfo:

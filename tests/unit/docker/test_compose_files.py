@@ -49,7 +49,7 @@ def test_ports_are_published_on_this_machine_only_by_default(name: str) -> None:
         assert re.fullmatch(r"\$\{[A-Z_]+:-127\.0\.0\.1:\d+\}:\d+", port)
 
 
-@pytest.mark.parametrize("name", set(SERVICES) - set(OWN_SERVICES))
+@pytest.mark.parametrize("name", sorted(set(SERVICES) - set(OWN_SERVICES)))
 def test_third_party_images_are_pinned(name: str) -> None:
     assert re.search(r":v?\d+\.\d+\.\d+\b", SERVICES[name]["image"])
 

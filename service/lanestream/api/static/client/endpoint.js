@@ -49,7 +49,8 @@ export function refusalError(status, body, endpoint) {
         const problem = JSON.parse(body);
         const message = problem.message ?? problem.detail;
         if (typeof problem.code === "string" && typeof message === "string") {
-            return new LaneError(problem.code, message, String(problem.hint ?? ""), { httpStatus: status });
+            const details = { httpStatus: status, requestId: problem.request_id ?? null };
+            return new LaneError(problem.code, message, String(problem.hint ?? ""), details);
         }
     }
     catch {

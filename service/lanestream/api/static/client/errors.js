@@ -1,7 +1,7 @@
 /**
  * Every error of this library. `code` is for programs; docs/protocol.md lists those of the service. `message` says what
  * was wrong, `hint` what is accepted or what to do. An error with a `seq` is about that frame only; a `fatal` one ended
- * the stream.
+ * the stream. `requestId` is what the log of the service calls a refused request.
  */
 export class LaneError extends Error {
     code;
@@ -9,6 +9,7 @@ export class LaneError extends Error {
     seq;
     fatal;
     httpStatus;
+    requestId;
     constructor(code, message, hint = "", details = {}) {
         super(message);
         this.name = "LaneError";
@@ -17,6 +18,7 @@ export class LaneError extends Error {
         this.seq = details.seq ?? null;
         this.fatal = details.fatal ?? false;
         this.httpStatus = details.httpStatus ?? null;
+        this.requestId = details.requestId ?? null;
     }
     static fromMessage(message) {
         return new LaneError(message.code, message.message, message.hint, message);
@@ -27,7 +29,7 @@ export class LaneError extends Error {
     }
     /** Returns this error as the one that ended the stream. */
     asFatal() {
-        const details = { seq: this.seq, fatal: true, httpStatus: this.httpStatus };
+        const details = { seq: this.seq, fatal: true, httpStatus: this.httpStatus, requestId: this.requestId };
         return new LaneError(this.code, this.message, this.hint, details);
     }
 }
