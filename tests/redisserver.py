@@ -44,7 +44,8 @@ class RedisServer:
     def stop(self) -> None:
         """Ends it. Its sessions are lost."""
         if self._process is not None:
-            self._process.terminate()
+            # It would not end on SIGTERM if it could not save its data.
+            self._process.kill()
             self._process.wait()
 
 

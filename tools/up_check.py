@@ -356,15 +356,17 @@ def received(socket: ClientConnection, kind: str) -> dict[str, Any]:
     return message
 
 
+def prometheus(stack: Stack, path: str) -> Any:
+    """Returns the data of an answer of Prometheus' API, which is not published."""
+    url = f"http://127.0.0.1:9090/api/v1/{path}"
+    return json.loads(stack.run_in("prometheus", "wget", "-qO-", url))["data"]
+
+
 def check_prometheus(stack: Stack) -> None:
     """Checks that Prometheus scrapes the service with its key, and has evaluated every alert."""
 
-    def api(path: str) -> Any:
-        answer = json.loads(stack.run_in("prometheus", "wget", "-qO-", f"http://127.0.0.1:9090/api/v1/{path}"))
-        return answer["data"]
-
     def scraped() -> bool:
-        targets = api("targets?state=active")["activeTargets"]
+        targets = prometheus(stack, "targets?state=active")["activeTargets"]
         return [target["health"] for target in targets if target["labels"]["job"] == "lanestream"] == ["up"]
 
     wait_until(scraped, "Prometheus does not scrape the service")
@@ -374,7 +376,7 @@ def check_prometheus(stack: Stack) -> None:
     names = {alert["alert"] for alert in alerts}
 
     def evaluated() -> bool:
-        rules = [rule for group in api("rules")["groups"] for rule in group["rules"]]
+        rules = [rule for group in prometheus(stack, "rules")["groups"] for rule in group["rules"]]
         return {rule["name"] for rule in rules if rule["health"] == "ok"} == names
 
     wait_until(evaluated, "Prometheus could not evaluate every alert")
@@ -401,12 +403,20 @@ def check_grafana(stack: Stack) -> None:
 
 def check_lost_redis(stack: Stack, images: list[bytes]) -> None:
     """Checks that streams live without Redis, and that the loss is reported."""
+
+    def alert() -> bool:
+        alerts = prometheus(stack, "alerts")["alerts"]
+        return any(each["labels"]["alertname"] == "LanestreamStoreUnreachable" for each in alerts)
+
     redis = stack.container("redis")["Id"]
     stack.engine.run("stop", "-t", "5", redis)
     check_ready(stack, store_reachable=False)
     check_stream(stack, images)
+    wait_until(alert, "the loss of Redis raises no alert")
     stack.engine.run("start", redis)
     check_ready(stack, store_reachable=True)
+    wait_until(lambda: not alert(), "the alert does not end when Redis is back")
+    passed("the loss of Redis raises an alert, which ends when Redis is back")
 
 
 def check_down(stack: Stack) -> None:
