@@ -1,3 +1,3 @@
 """Lanestream: camera frames in, tracked lane lines out."""
 
-__version__ = "0.15.0"
+__version__ = "0.16.0"
