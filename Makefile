@@ -166,8 +166,8 @@ BUILD_REQUIREMENTS := import tomllib; print(*tomllib.load(open("pyproject.toml",
 # Locks the packages of the images, and those that build our own: the newest versions that pyproject.toml allows.
 lock: | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster --extra tracing -o docker/requirements-cpu.txt pyproject.toml
-	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
+	$(LOCK) --extra service --extra cpu --extra openvino --extra redis --extra tracing -o docker/requirements-cpu.txt pyproject.toml
+	$(LOCK) --extra service --extra gpu --extra redis --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
 .PHONY: docs docs-serve
@@ -217,7 +217,7 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,docs,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,redis,train,bench,docs,dev]'
 	@touch $@ $(RUN_READY)
 
 $(JS_READY): client/js/package-lock.json
