@@ -67,16 +67,21 @@ def serve(
     must be able to import it. `on_ready` is called once frames can be processed, in a thread, with a URL that reaches
     the service from this machine. Raises SettingsError if the address can't be listened on, and any error of `load`.
     """
-    # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
-    cv2.setNumThreads(settings.opencv_threads)
-    # Images and messages of a few megabytes come and go, and must not add up.
-    keep_freed_memory(_LARGEST_KEPT_BYTES)
+    tune_process(settings)
     app = create_app(None, settings, draw)
     listener = listen(settings.host, settings.port)
     server = LanestreamServer(app, settings)
     app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     with server.stopping_on_signals(), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
         runner.run(_serve(server, listener, app, load, on_ready))
+
+
+def tune_process(settings: Settings) -> None:
+    """Sets how this process uses processors and memory; to be called before it gets its first image."""
+    # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
+    cv2.setNumThreads(settings.opencv_threads)
+    # Images and messages of a few megabytes come and go, and must not add up.
+    keep_freed_memory(_LARGEST_KEPT_BYTES)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -116,7 +121,7 @@ class LanestreamServer(uvicorn.Server):
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         super().__init__(server_config(app, settings))
         self._service: Service = app.state.service
-        self.keys_requested = False
+        self._keys_requested = False
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -135,7 +140,7 @@ class LanestreamServer(uvicorn.Server):
 
         def stop(number: int, _: FrameType | None) -> None:
             if number == signal.SIGHUP and self._service.settings.api_keys_file is not None:
-                self.keys_requested = True
+                self._keys_requested = True
                 return
             if received and number != signal.SIGHUP:
                 flush_logs()
@@ -157,6 +162,11 @@ class LanestreamServer(uvicorn.Server):
                 signal.signal(number, handler)
         if received and received[0] != signal.SIGINT:
             signal.raise_signal(received[0])
+
+    def take_key_request(self) -> bool:
+        """Returns whether SIGHUP has asked for the file of API keys since the last call."""
+        requested, self._keys_requested = self._keys_requested, False
+        return requested
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drains the streams, then shuts uvicorn down, which closes the sockets."""
@@ -180,7 +190,7 @@ async def _serve(
         _log.warning("%s", conflict)
     url = _http_url(host, port)
     _log.info("listening on %s, loading the networks", url, extra={"event": "listening", "url": url})
-    starting = asyncio.create_task(_start_pool(app.state.service, load))
+    starting = asyncio.create_task(start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
     if not starting.done():  # a signal came first
         starting.cancel()
@@ -212,25 +222,32 @@ async def _serve(
         server.should_exit = True
         await serving
         raise
-    upkeep = [asyncio.create_task(_return_memory())]
-    if app.state.service.settings.api_keys_file is not None:
-        upkeep.append(asyncio.create_task(_watch_keys(server, app.state.service)))
+    upkeep = start_upkeep(app.state.service, server.take_key_request)
     await serving
     for task in upkeep:
         task.cancel()
 
 
-async def _watch_keys(server: LanestreamServer, service: Service) -> None:
-    """Reads the file of API keys again when it has changed, and when SIGHUP asks for it."""
-    path = service.settings.api_keys_file
-    assert path is not None  # noqa: S101 - checked by the caller
+def start_upkeep(service: Service, take_key_request: Callable[[], bool]) -> list[asyncio.Task[None]]:
+    """Starts the background tasks of a process that serves. Cancel them at its end.
+
+    `take_key_request` returns whether the file of API keys must be read again although it did not change.
+    """
+    tasks = [asyncio.create_task(_return_memory())]
+    if service.settings.api_keys_file is not None:
+        tasks.append(asyncio.create_task(_watch_keys(service, service.settings.api_keys_file, take_key_request)))
+    return tasks
+
+
+async def _watch_keys(service: Service, path: Path, take_key_request: Callable[[], bool]) -> None:
+    """Reads the file of API keys again when it has changed, and when it is requested."""
     loaded, previous = None, None
     while True:
         await asyncio.sleep(_KEYS_POLL_S)
         found = await asyncio.to_thread(_version_of, path)
         # A file that is still being written may lack keys, so it must not have changed since the last look.
-        if server.keys_requested or (found != loaded and found == previous):
-            server.keys_requested, loaded = False, found
+        if take_key_request() or (found != loaded and found == previous):
+            loaded = found
             service.reload_keys()
         previous = found
 
@@ -261,7 +278,7 @@ async def _return_memory() -> None:
         return_freed_memory()
 
 
-async def _start_pool(service: Service, load: Callable[[], Engine]) -> WorkerPool:
+async def start_pool(service: Service, load: Callable[[], Engine]) -> WorkerPool:
     """Returns a warm worker pool: worker processes, or threads of this process if the settings ask for that."""
     settings, metrics = service.settings, service.metrics
     if settings.processes == 0:

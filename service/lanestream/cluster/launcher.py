@@ -1,0 +1,205 @@
+"""`lanestream cluster up`: deploys the service on a Ray cluster, a local one by default, and removes it at the end."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import logging.config
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final
+
+from lanestream.api.auth import Authenticator, warn_if_open
+from lanestream.api.server import listen
+from lanestream.cluster.options import ClusterOptions, check_settings
+from lanestream.errors import LanestreamError, SettingsError, needs_extra, one_line
+from lanestream.host import processors
+from lanestream.logs import flush_logs, log_config
+
+with needs_extra("cluster,cpu"):
+    import ray
+    from ray import serve
+    from ray.exceptions import RayError
+
+    from lanestream.cluster.deployment import application
+
+if TYPE_CHECKING:
+    from lanestream.settings import Settings
+
+_log = logging.getLogger(__name__)
+_APPLICATION: Final = "lanestream"
+_CONNECT_S: Final = 10.0
+_POLL_S: Final = 2.0
+# What shells add to the number of the signal by which a process ended.
+_SIGNALED: Final = 128
+
+
+def up(settings: Settings, options: ClusterOptions, address: str | None) -> None:
+    """Serves on the Ray cluster at `address`, or on a local one that it starts, until a signal stops the process.
+
+    Then it drains the replicas, and stops what it started. Raises SettingsError if the settings can't be used or the
+    cluster can't be reached, and LanestreamError if the replicas can't start.
+    """
+    check_settings(settings, options)
+    authenticator = Authenticator.from_settings(settings)
+    logging.config.dictConfig(log_config(settings))
+    if address is None:
+        settings = _check_machine(settings, options)
+    with _stop_signals() as stop:
+        _connect(address)
+        try:
+            warn_if_open(authenticator, settings.host, loopback=_is_loopback(settings.host))
+            with _deployed(settings, options):
+                stop.began()
+                _follow(stop)
+        except KeyboardInterrupt:
+            _log.info("stopped before it was ready")
+        finally:
+            ray.shutdown()
+            flush_logs()
+
+
+class _Stop:
+    """A signal to stop. While the replicas start, it interrupts the main thread."""
+
+    def __init__(self) -> None:
+        self.requested = threading.Event()
+        self._starting = True
+
+    def began(self) -> None:
+        """Notes that the replicas have started."""
+        self._starting = False
+
+    def __call__(self, number: int, _: FrameType | None) -> None:
+        if self.requested.is_set():
+            flush_logs()
+            os._exit(_SIGNALED + number)
+        self.requested.set()
+        if self._starting:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def _stop_signals() -> Iterator[_Stop]:
+    stop = _Stop()
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _check_machine(settings: Settings, options: ClusterOptions) -> Settings:
+    """Returns the settings with a port that is free. Raises SettingsError if this machine can't run the replicas."""
+    needed, available = options.max_replicas * options.cpus, processors()
+    if needed > available:
+        raise SettingsError(
+            f"{options.max_replicas} replicas with {options.cpus:g} processors each need {needed:g}; this machine has"
+            f" {available}",
+            "use fewer --replicas, or smaller ones with --cpus",
+        )
+    with listen(settings.host, settings.port) as listener:
+        return settings.model_copy(update={"port": listener.getsockname()[1]})
+
+
+def _connect(address: str | None) -> None:
+    """Connects to a cluster, or starts a local one. Raises SettingsError if it can't be reached."""
+    _log.info(
+        "starting Ray" if address is None else "connecting to the Ray cluster at %s", *([address] if address else [])
+    )
+    local: dict[str, Any] = {"num_cpus": processors(), "include_dashboard": False} if address is None else {}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        if address is not None:
+            _check_reachable(address)
+        ray.init(address or "local", logging_level=logging.ERROR, **local)
+    except (OSError, OverflowError, RuntimeError, ValueError) as error:
+        where = f"can't use the Ray cluster at {address}" if address else "can't start Ray"
+        raise SettingsError(
+            f"{where}: {one_line(error)}", "give the address that `ray start` printed" if address else ""
+        ) from None
+    for number, handler in handlers.items():  # Ray sets handlers of its own
+        signal.signal(number, handler)
+    logging.getLogger("ray.serve").setLevel(logging.ERROR)
+
+
+def _check_reachable(address: str) -> None:
+    """Raises OSError if nothing listens at an address with a port, for which Ray itself would wait for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
+
+
+@contextmanager
+def _deployed(settings: Settings, options: ClusterOptions) -> Iterator[None]:
+    """Runs the application during the block. Raises LanestreamError if it can't start."""
+    status = _status()
+    if status is not None and _APPLICATION in status.applications:
+        raise SettingsError("Lanestream already runs on this cluster", "stop it there, or use another cluster")
+    quiet = {"log_level": "WARNING", "enable_access_log": False}
+    try:
+        if status is None:
+            http = {"host": settings.host, "port": settings.port}
+            serve.start(proxy_location="EveryNode", http_options=http, logging_config=quiet)
+        _log.info("starting %d replicas and loading the networks", options.min_replicas)
+        try:
+            serve.run(application(settings, options), name=_APPLICATION, route_prefix="/", logging_config=quiet)
+        except RuntimeError as error:
+            raise LanestreamError(f"the replicas can't start: {_cause(error)}", "see the log above") from None
+        for url in _urls(settings, started=status is None):
+            _log.info("ready at %s", url, extra={"event": "ready", "url": url})
+        yield
+    finally:
+        _log.info("draining the replicas")
+        if status is None:
+            serve.shutdown()
+        else:
+            serve.delete(_APPLICATION)
+
+
+def _status() -> Any | None:
+    """Returns the status of Serve; None if it does not run on the cluster."""
+    status = serve.status()
+    return status if status.proxies or status.applications else None
+
+
+def _urls(settings: Settings, *, started: bool) -> list[str]:
+    """Returns the URLs of the proxies, as far as they can be reached from here."""
+    if not started:
+        return ["the proxies of this cluster's Ray Serve"]
+    if _is_loopback(settings.host):
+        return [_url(settings.host, settings.port)]
+    running = set(serve.status().proxies)
+    return [_url(node["NodeManagerAddress"], settings.port) for node in ray.nodes() if node["NodeID"] in running]
+
+
+def _url(host: str, port: int) -> str:
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _cause(error: RuntimeError) -> str:
+    """Returns the last line of the traceback in Serve's message, which names the error in the replica."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return one_line(lines[-1] if lines else error)
+
+
+def _follow(stop: _Stop) -> None:
+    """Waits for a signal. Raises LanestreamError if the cluster is gone."""
+    while not stop.requested.wait(_POLL_S):
+        try:
+            serve.status()
+        except (RayError, ConnectionError, RuntimeError) as error:
+            raise LanestreamError(f"the cluster is gone: {one_line(error)}") from None
