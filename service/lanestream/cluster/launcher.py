@@ -54,7 +54,7 @@ def up(settings: Settings, options: ClusterOptions, address: str | None) -> None
         _connect(address)
         try:
             warn_if_open(authenticator, settings.host, loopback=_is_loopback(settings.host))
-            with _deployed(settings, options):
+            with _deployed(settings, options, local=address is None):
                 stop.began()
                 _follow(stop)
         except KeyboardInterrupt:
@@ -137,7 +137,7 @@ def _check_reachable(address: str) -> None:
 
 
 @contextmanager
-def _deployed(settings: Settings, options: ClusterOptions) -> Iterator[None]:
+def _deployed(settings: Settings, options: ClusterOptions, *, local: bool) -> Iterator[None]:
     """Runs the application during the block. Raises LanestreamError if it can't start."""
     status = _status()
     if status is not None and _APPLICATION in status.applications:
@@ -147,7 +147,7 @@ def _deployed(settings: Settings, options: ClusterOptions) -> Iterator[None]:
         if status is None:
             http = {"host": settings.host, "port": settings.port}
             serve.start(proxy_location="EveryNode", http_options=http, logging_config=quiet)
-        _log.info("starting %d replicas and loading the networks", options.min_replicas)
+        _log.info("starting replicas, at first %d, and loading the networks", options.min_replicas)
         try:
             serve.run(application(settings, options), name=_APPLICATION, route_prefix="/", logging_config=quiet)
         except RuntimeError as error:
@@ -157,10 +157,9 @@ def _deployed(settings: Settings, options: ClusterOptions) -> Iterator[None]:
         yield
     finally:
         _log.info("draining the replicas")
-        if status is None:
+        serve.delete(_APPLICATION)
+        if status is None and not local:
             serve.shutdown()
-        else:
-            serve.delete(_APPLICATION)
 
 
 def _status() -> Any | None:

@@ -12,6 +12,11 @@ RAY_VARIABLES: Final[Mapping[str, str]] = {
     "RAY_SERVE_ENABLE_HA_PROXY": "0",
     # Otherwise a proxy fills the replicas of its own machine before it uses those of others.
     "RAY_SERVE_PROXY_PREFER_LOCAL_NODE_ROUTING": "0",
+    # Ray waits for three failed checks before it believes that a machine is lost: by default that takes 12 seconds or
+    # more, and streams wait for it.
+    "RAY_health_check_period_ms": "500",
+    "RAY_health_check_timeout_ms": "1000",
+    "RAY_health_check_failure_threshold": "3",
     # Replicas start worker processes, of which gRPC needs to know nothing.
     "GRPC_ENABLE_FORK_SUPPORT": "0",
     # Ray sends no statistics over the internet.

@@ -1,0 +1,137 @@
+"""The service on a Ray cluster of several nodes on this machine. `make cluster-check` runs it with three nodes.
+
+Its variables: CLUSTER_NODES and CLUSTER_STREAMS. It prints the times that it measured, which are no assertions.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fakes
+import pytest
+from raycluster import IN_FLIGHT, WAIT_S, Camera, RayCluster, ray_cluster
+from redisserver import redis_server
+
+from lanestream.cluster.ray_variables import RAY_VARIABLES
+from lanestream.settings import Settings
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    serve = pytest.importorskip("ray.serve", reason="needs Ray: use `make cluster-check`")
+    from lanestream.cluster.deployment import application
+    from lanestream.cluster.options import ClusterOptions
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+NODES = int(os.environ.get("CLUSTER_NODES", "2"))
+STREAMS = int(os.environ.get("CLUSTER_STREAMS", "8"))
+# Serve counts streams every ten seconds, unless this is set.
+QUICK = {"RAY_SERVE_HANDLE_AUTOSCALING_METRIC_PUSH_INTERVAL_S": "1"}
+
+
+@pytest.fixture
+def redis_url(tmp_path: Path) -> Iterator[str]:
+    with redis_server(tmp_path) as url:
+        yield url
+
+
+@pytest.fixture
+def cluster() -> Iterator[RayCluster]:
+    with ray_cluster(NODES, **RAY_VARIABLES, **QUICK) as cluster:
+        yield cluster
+
+
+def deploy(redis_url: str, **options: Any) -> None:
+    settings = Settings(redis_url=redis_url, processes=0)
+    serve.run(application(settings, ClusterOptions(**options), fakes.engine), name="lanestream", route_prefix="/")
+
+
+def open_cameras(urls: list[str], count: int = STREAMS, **camera: Any) -> list[Camera]:
+    """Starts cameras, each of which tries another proxy first, and waits until all have answers."""
+    starts = [number % len(urls) for number in range(count)]
+    cameras = [Camera(number, [*urls[start:], *urls[:start]], **camera) for number, start in enumerate(starts)]
+    for each in cameras:
+        each.wait_for_answers(5)
+    return cameras
+
+
+def check(camera: Camera, lost: int) -> None:
+    """Fails unless each frame has a result, in order, at most so many of them lost, over one session."""
+    assert [result.frame.seq for result in camera.results] == list(range(camera.frames))
+    assert {result.error.code for result in camera.results if result.error is not None} <= {"lost"}
+    assert camera.lost <= lost
+    assert len(camera.sessions) == 1
+    late = [ids for _, _, ids in camera.answers[camera.first_frames :]]
+    assert set(late) == {camera.ids}
+
+
+def test_streams_survive_the_loss_of_a_node(cluster: RayCluster, redis_url: str, capsys: Any) -> None:
+    deploy(redis_url, min_replicas=NODES, max_replicas=NODES)
+    cameras = open_cameras(cluster.urls)
+    time.sleep(1.0)
+    killed = time.monotonic()
+    cluster.kill_last_node()
+    for camera in cameras:
+        count = len(camera.answers)
+        camera.wait_for_answers(count + 10)
+    time.sleep(3.0)
+    for camera in cameras:
+        camera.finish()
+    times = [seconds for camera in cameras if (seconds := camera.resumed_after(killed)) is not None]
+    assert times, "no stream was on the node that was killed"
+    for camera in cameras:
+        check(camera, lost=IN_FLIGHT)
+    with capsys.disabled():
+        print(
+            f"\n{NODES} nodes, {STREAMS} streams, one node killed: {len(times)} streams resumed,"
+            f" after {statistics.median(times):.2f} s (median), {max(times):.2f} s (longest);"
+            f" {sum(camera.frames for camera in cameras)} frames sent, {sum(len(camera.answers) for camera in cameras)}"
+            f" answered, {sum(camera.lost for camera in cameras)} reported as lost"
+        )
+
+
+def wait_for_replicas(cluster: RayCluster, count: int) -> None:
+    """Waits until so many replicas run and each has sessions."""
+    end = time.monotonic() + 2 * WAIT_S
+    while True:
+        status = serve.status().applications["lanestream"].deployments["Lanestream"]
+        running = status.replica_states
+        found = {name: value for name, value in cluster.sessions().items() if value}
+        if dict(running) == {"RUNNING": count} and len(found) == count:
+            return
+        assert time.monotonic() < end, (running, found)
+        time.sleep(0.5)
+
+
+def test_no_frame_is_lost_when_replicas_come_and_go(cluster: RayCluster, redis_url: str, capsys: Any) -> None:
+    per_replica = STREAMS // NODES
+    deploy(
+        redis_url,
+        max_replicas=NODES,
+        sessions_per_replica=per_replica,
+        upscale_delay_s=1.0,
+        downscale_delay_s=1.0,
+    )
+    cameras = open_cameras(cluster.urls)
+    wait_for_replicas(cluster, NODES)
+    for camera in cameras[per_replica:]:
+        camera.finish()
+    wait_for_replicas(cluster, 1)
+    for camera in cameras[:per_replica]:
+        camera.finish()
+    for camera in cameras:
+        check(camera, lost=0)
+        assert len(camera.answers) == camera.frames
+    with capsys.disabled():
+        print(
+            f"\n{NODES} nodes, {STREAMS} streams, 1 to {NODES} to 1 replicas:"
+            f" {sum(camera.frames for camera in cameras)} frames sent,"
+            f" {sum(camera.frames - len(camera.answers) for camera in cameras)} without lanes,"
+            f" {sum(camera.answers[-1][1] for camera in cameras)} reconnections"
+        )
