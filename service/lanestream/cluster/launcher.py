@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
-from lanestream.api.auth import Authenticator, warn_if_open
+from lanestream.api.app import create_app
+from lanestream.api.auth import warn_if_open
 from lanestream.api.server import listen
 from lanestream.cluster.options import ClusterOptions, check_settings
 from lanestream.errors import LanestreamError, SettingsError, needs_extra, one_line
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _APPLICATION: Final = "lanestream"
+_LOGS: Final = "the logs of the replicas are in /tmp/ray/session_latest/logs"
 _CONNECT_S: Final = 10.0
 _POLL_S: Final = 2.0
 # What shells add to the number of the signal by which a process ended.
@@ -46,7 +48,8 @@ def up(settings: Settings, options: ClusterOptions, address: str | None) -> None
     cluster can't be reached, and LanestreamError if the replicas can't start.
     """
     check_settings(settings, options)
-    authenticator = Authenticator.from_settings(settings)
+    # Finds what is wrong before Ray starts.
+    authenticator = create_app(None, settings).state.service.authenticator
     logging.config.dictConfig(log_config(settings))
     if address is None:
         settings = _check_machine(settings, options)
@@ -65,10 +68,11 @@ def up(settings: Settings, options: ClusterOptions, address: str | None) -> None
 
 
 class _Stop:
-    """A signal to stop. While the replicas start, it interrupts the main thread."""
+    """The signal to stop. While the replicas start, it interrupts the main thread; a second one ends the process."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
+        self.number: int | None = None
         self._starting = True
 
     def began(self) -> None:
@@ -79,6 +83,7 @@ class _Stop:
         if self.requested.is_set():
             flush_logs()
             os._exit(_SIGNALED + number)
+        self.number = number
         self.requested.set()
         if self._starting:
             raise KeyboardInterrupt
@@ -93,6 +98,9 @@ def _stop_signals() -> Iterator[_Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    if stop.number not in (None, signal.SIGINT):
+        # The parent process sees why this one ended.
+        signal.raise_signal(stop.number)
 
 
 def _check_machine(settings: Settings, options: ClusterOptions) -> Settings:
@@ -100,8 +108,7 @@ def _check_machine(settings: Settings, options: ClusterOptions) -> Settings:
     needed, available = options.max_replicas * options.cpus, processors()
     if needed > available:
         raise SettingsError(
-            f"{options.max_replicas} replicas with {options.cpus:g} processors each need {needed:g}; this machine has"
-            f" {available}",
+            f"the replicas need {needed:g} processors, and this machine has {available}",
             "use fewer --replicas, or smaller ones with --cpus",
         )
     with listen(settings.host, settings.port) as listener:
@@ -151,7 +158,7 @@ def _deployed(settings: Settings, options: ClusterOptions, *, local: bool) -> It
         try:
             serve.run(application(settings, options), name=_APPLICATION, route_prefix="/", logging_config=quiet)
         except RuntimeError as error:
-            raise LanestreamError(f"the replicas can't start: {_cause(error)}", "see the log above") from None
+            raise LanestreamError(f"the replicas can't start: {_cause(error)}", _LOGS) from None
         for url in _urls(settings, started=status is None):
             _log.info("ready at %s", url, extra={"event": "ready", "url": url})
         yield
@@ -190,9 +197,12 @@ def _is_loopback(host: str) -> bool:
 
 
 def _cause(error: RuntimeError) -> str:
-    """Returns the last line of the traceback in Serve's message, which names the error in the replica."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return one_line(lines[-1] if lines else error)
+    """Returns why the replicas can't start: the last line of the traceback that Serve has of one of them."""
+    application = serve.status().applications.get(_APPLICATION)
+    messages = [] if application is None else [each.message for each in application.deployments.values()]
+    lines = [line.strip() for line in "\n".join([str(error), *messages]).splitlines() if line.strip()]
+    found = [line.partition(": ")[2] for line in lines if line.startswith("lanestream.errors.")]
+    return one_line((found or lines)[-1], 400)
 
 
 def _follow(stop: _Stop) -> None:

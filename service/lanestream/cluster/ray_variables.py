@@ -17,6 +17,8 @@ RAY_VARIABLES: Final[Mapping[str, str]] = {
     "RAY_health_check_period_ms": "500",
     "RAY_health_check_timeout_ms": "1000",
     "RAY_health_check_failure_threshold": "3",
+    # Serve's own log goes to its files only.
+    "RAY_SERVE_LOG_TO_STDERR": "0",
     # Replicas start worker processes, of which gRPC needs to know nothing.
     "GRPC_ENABLE_FORK_SUPPORT": "0",
     # Ray sends no statistics over the internet.
