@@ -35,6 +35,7 @@ class RayCluster:
     def __init__(self, cluster: Any, ports: list[int]) -> None:
         self._cluster = cluster
         self.address: str = cluster.address
+        self.logs = Path(cluster.head_node.get_logs_dir_path())
         self.ports = ports
         self.urls = [f"http://127.0.0.1:{port}" for port in ports]
 

@@ -10,11 +10,11 @@ import statistics
 import time
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import fakes
 import pytest
+from pydantic import SecretStr
 from raycluster import IN_FLIGHT, WAIT_S, Camera, RayCluster, ray_cluster
 from redisserver import redis_server
 
@@ -29,26 +29,27 @@ with warnings.catch_warnings():
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
+SECRET = "a secret that nobody may see anywhere"
 NODES = int(os.environ.get("CLUSTER_NODES", "2"))
 STREAMS = int(os.environ.get("CLUSTER_STREAMS", "8"))
 # Serve counts streams every ten seconds, unless this is set.
 QUICK = {"RAY_SERVE_HANDLE_AUTOSCALING_METRIC_PUSH_INTERVAL_S": "1"}
 
 
-@pytest.fixture
-def redis_url(tmp_path: Path) -> Iterator[str]:
-    with redis_server(tmp_path) as url:
+@pytest.fixture(scope="module")
+def redis_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with redis_server(tmp_path_factory.mktemp("redis")) as url:
         yield url
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def cluster() -> Iterator[RayCluster]:
     with ray_cluster(NODES, **RAY_VARIABLES, **QUICK) as cluster:
         yield cluster
 
 
 def deploy(redis_url: str, **options: Any) -> None:
-    settings = Settings(redis_url=redis_url, processes=0)
+    settings = Settings(redis_url=redis_url, processes=0, token_secret=SecretStr(SECRET))
     serve.run(application(settings, ClusterOptions(**options), fakes.engine), name="lanestream", route_prefix="/")
 
 
@@ -69,31 +70,6 @@ def check(camera: Camera, lost: int) -> None:
     assert len(camera.sessions) == 1
     late = [ids for _, _, ids in camera.answers[camera.first_frames :]]
     assert set(late) == {camera.ids}
-
-
-def test_streams_survive_the_loss_of_a_node(cluster: RayCluster, redis_url: str, capsys: Any) -> None:
-    deploy(redis_url, min_replicas=NODES, max_replicas=NODES)
-    cameras = open_cameras(cluster.urls)
-    time.sleep(1.0)
-    killed = time.monotonic()
-    cluster.kill_last_node()
-    for camera in cameras:
-        count = len(camera.answers)
-        camera.wait_for_answers(count + 10)
-    time.sleep(3.0)
-    for camera in cameras:
-        camera.finish()
-    times = [seconds for camera in cameras if (seconds := camera.resumed_after(killed)) is not None]
-    assert times, "no stream was on the node that was killed"
-    for camera in cameras:
-        check(camera, lost=IN_FLIGHT)
-    with capsys.disabled():
-        print(
-            f"\n{NODES} nodes, {STREAMS} streams, one node killed: {len(times)} streams resumed,"
-            f" after {statistics.median(times):.2f} s (median), {max(times):.2f} s (longest);"
-            f" {sum(camera.frames for camera in cameras)} frames sent, {sum(len(camera.answers) for camera in cameras)}"
-            f" answered, {sum(camera.lost for camera in cameras)} reported as lost"
-        )
 
 
 def wait_for_replicas(cluster: RayCluster, count: int) -> None:
@@ -135,3 +111,42 @@ def test_no_frame_is_lost_when_replicas_come_and_go(cluster: RayCluster, redis_u
             f" {sum(camera.frames - len(camera.answers) for camera in cameras)} without lanes,"
             f" {sum(camera.answers[-1][1] for camera in cameras)} reconnections"
         )
+
+
+def test_streams_survive_the_loss_of_a_node(cluster: RayCluster, redis_url: str, capsys: Any) -> None:
+    deploy(redis_url, min_replicas=NODES, max_replicas=NODES)
+    cameras = open_cameras(cluster.urls)
+    time.sleep(1.0)
+    killed = time.monotonic()
+    cluster.kill_last_node()
+    for camera in cameras:
+        count = len(camera.answers)
+        camera.wait_for_answers(count + 10)
+    time.sleep(3.0)
+    for camera in cameras:
+        camera.finish()
+    times = [seconds for camera in cameras if (seconds := camera.resumed_after(killed)) is not None]
+    assert times, "no stream was on the node that was killed"
+    for camera in cameras:
+        check(camera, lost=IN_FLIGHT)
+    with capsys.disabled():
+        print(
+            f"\n{NODES} nodes, {STREAMS} streams, one node killed: {len(times)} streams resumed,"
+            f" after {statistics.median(times):.2f} s (median), {max(times):.2f} s (longest);"
+            f" {sum(camera.frames for camera in cameras)} frames sent, {sum(len(camera.answers) for camera in cameras)}"
+            f" answered, {sum(camera.lost for camera in cameras)} reported as lost"
+        )
+
+
+def test_ray_shows_no_secrets(cluster: RayCluster, redis_url: str) -> None:
+    import ray
+
+    deploy(redis_url)
+    controller = ray.get_actor("SERVE_CONTROLLER_ACTOR", namespace="serve")
+    # What the dashboard and `serve status` show.
+    shown = str(ray.get(controller.get_serve_instance_details.remote()))
+    assert "health_check_timeout_s" in shown
+    assert SECRET not in shown
+    logs = [path for path in cluster.logs.rglob("*") if path.is_file()]
+    assert any("replica" in path.name for path in logs)
+    assert not [path for path in logs if SECRET.encode() in path.read_bytes()]

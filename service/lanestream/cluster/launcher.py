@@ -158,7 +158,7 @@ def _deployed(settings: Settings, options: ClusterOptions, *, local: bool) -> It
         try:
             serve.run(application(settings, options), name=_APPLICATION, route_prefix="/", logging_config=quiet)
         except RuntimeError as error:
-            raise LanestreamError(f"the replicas can't start: {_cause(error)}", _LOGS) from None
+            raise _start_failure(error) from None
         for url in _urls(settings, started=status is None):
             _log.info("ready at %s", url, extra={"event": "ready", "url": url})
         yield
@@ -196,13 +196,14 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _cause(error: RuntimeError) -> str:
+def _start_failure(error: RuntimeError) -> LanestreamError:
     """Returns why the replicas can't start: the last line of the traceback that Serve has of one of them."""
     application = serve.status().applications.get(_APPLICATION)
     messages = [] if application is None else [each.message for each in application.deployments.values()]
     lines = [line.strip() for line in "\n".join([str(error), *messages]).splitlines() if line.strip()]
     found = [line.partition(": ")[2] for line in lines if line.startswith("lanestream.errors.")]
-    return one_line((found or lines)[-1], 400)
+    reason = one_line((found or lines)[-1], 400)
+    return LanestreamError(f"the replicas can't start: {reason}", "" if found else _LOGS)
 
 
 def _follow(stop: _Stop) -> None:
