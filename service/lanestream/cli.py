@@ -235,12 +235,9 @@ def up(
     Every setting of `serve` can also be given as LANESTREAM_<NAME>, or in the file of --config. More than one replica
     needs LANESTREAM_REDIS_URL.
     """
-    from lanestream.cluster.ray_variables import set_ray_variables
-
-    set_ray_variables()
     with needs_extra(_CLUSTER_EXTRA):
-        from lanestream.cluster.launcher import up as run
-        from lanestream.cluster.options import ClusterOptions, parse_replicas
+        from lanestream.cluster.options import ClusterOptions, check_settings, parse_replicas
+        from lanestream.cluster.ray_variables import set_ray_variables
         from lanestream.settings import load_settings
 
     try:
@@ -249,9 +246,14 @@ def up(
         raise click.BadParameter(f"{error}.", param_hint="'--replicas'") from None
     given = {"sessions_per_replica": sessions_per_replica, "cpus": cpus, "gpus": gpus}
     values = {name: value for name, value in given.items() if value is not None}
-    run(
-        load_settings(**options), ClusterOptions.parse({"min_replicas": least, "max_replicas": most, **values}), address
-    )
+    cluster_options = ClusterOptions.parse({"min_replicas": least, "max_replicas": most, **values})
+    settings = load_settings(**options)
+    check_settings(settings, cluster_options)
+    set_ray_variables()
+    with needs_extra(_CLUSTER_EXTRA):
+        # Takes seconds.
+        from lanestream.cluster.launcher import up as run
+    run(settings, cluster_options, address)
 
 
 @cli.command()

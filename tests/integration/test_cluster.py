@@ -29,7 +29,7 @@ with warnings.catch_warnings():
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-SECRET = "a secret that nobody may see anywhere"
+SECRET = "a secret that nobody may see anywhere"  # noqa: S105
 NODES = int(os.environ.get("CLUSTER_NODES", "2"))
 STREAMS = int(os.environ.get("CLUSTER_STREAMS", "8"))
 # Serve counts streams every ten seconds, unless this is set.

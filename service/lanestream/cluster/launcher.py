@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Final
 from lanestream.api.app import create_app
 from lanestream.api.auth import warn_if_open
 from lanestream.api.server import listen
-from lanestream.cluster.options import ClusterOptions, check_settings
 from lanestream.errors import LanestreamError, SettingsError, needs_extra, one_line
 from lanestream.host import processors
 from lanestream.logs import flush_logs, log_config
@@ -30,6 +29,7 @@ with needs_extra("cluster,cpu"):
     from lanestream.cluster.deployment import application
 
 if TYPE_CHECKING:
+    from lanestream.cluster.options import ClusterOptions
     from lanestream.settings import Settings
 
 _log = logging.getLogger(__name__)
@@ -47,7 +47,6 @@ def up(settings: Settings, options: ClusterOptions, address: str | None) -> None
     Then it drains the replicas, and stops what it started. Raises SettingsError if the settings can't be used or the
     cluster can't be reached, and LanestreamError if the replicas can't start.
     """
-    check_settings(settings, options)
     # Finds what is wrong before Ray starts.
     authenticator = create_app(None, settings).state.service.authenticator
     logging.config.dictConfig(log_config(settings))
