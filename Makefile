@@ -25,7 +25,7 @@ DEV_READY := $(VENV)/.ready-dev
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack batch-ray batch-speed bench soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean js js-types
+.PHONY: attack batch-speed bench cluster-check ray-test soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up down clean js js-types
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -125,10 +125,17 @@ bench: $(DEV_READY)
 batch-speed: $(DEV_READY)
 	$(BIN)/python tools/batch_speed.py $(ARGS)
 
-# Tests `lanestream batch --ray` on a cluster of three nodes on this machine. Ray is large, so only this installs it.
-batch-ray: $(DEV_READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ray]'
-	$(BIN)/python -m pytest tests/integration/test_batch_ray.py
+CLUSTER_TESTS := $(addprefix tests/,integration/test_cluster.py integration/test_cluster_up.py unit/service/cluster unit/deploy/test_kuberay.py)
+
+# Installs Ray, which is large, and tests what needs it on clusters of two and three nodes on this machine.
+ray-test: $(DEV_READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ray,cluster]'
+	$(BIN)/python -m pytest tests/integration/test_batch_ray.py $(CLUSTER_TESTS)
+
+# Tests the service on a Ray cluster of three nodes on this machine, with 24 streams, and prints what it measured.
+cluster-check: $(DEV_READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[cluster]'
+	CLUSTER_NODES=3 CLUSTER_STREAMS=24 $(BIN)/python -m pytest $(CLUSTER_TESTS)
 
 # Attacks services that it starts on 127.0.0.1, and prints what normal cameras felt. Needs redis-server and faketime.
 attack: $(DEV_READY)

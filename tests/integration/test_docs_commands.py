@@ -52,6 +52,7 @@ NOT_RUN = [
     ("docs/client.md", "import asyncio*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import cv2*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import rerun*", "tests/integration/test_clients.py"),
+    ("docs/cluster.md", "*", "needs Ray; tests/integration/test_cluster.py and tests/integration/test_cluster_up.py"),
     ("docs/deployment.md", "make up", DOCKER),
     ("docs/deployment.md", "make image*", DOCKER),
     ("docs/deployment.md", "docker *", DOCKER),
@@ -88,7 +89,7 @@ PRINTED = {
     "import { readFile }*": "type: 'lanes'",
 }
 # Blocks in these languages are data or belong to other programs.
-NOT_CODE = {"html", "json", "nginx", "text", "toml", "yaml"}
+NOT_CODE = {"dockerfile", "html", "json", "nginx", "text", "toml", "yaml"}
 # Commands that are safe to run. Others must be listed above.
 SAFE = {"curl", "head", "lanestream", "make"}
 # With Node 20 `WebSocket` is an option.

@@ -14,7 +14,7 @@ from lanestream.errors import SettingsError
 if TYPE_CHECKING:
     from lanestream.settings import Settings
 
-_RANGE: Final = re.compile(r"(\d{1,4})(?:\.\.(\d{1,4}))?")
+_RANGE: Final = re.compile(r"(\d{1,4})(?:\.\.(\d{1,4}))?", re.ASCII)
 _SECRET_BYTES: Final = 32
 # Ray's proxy closes a WebSocket whose client sends a larger message. uvicorn has this limit, and Ray does not set it.
 _MOST_MESSAGE_BYTES: Final = 16 << 20

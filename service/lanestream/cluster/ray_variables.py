@@ -14,7 +14,7 @@ RAY_VARIABLES: Final[Mapping[str, str]] = {
     "RAY_SERVE_PROXY_PREFER_LOCAL_NODE_ROUTING": "0",
     # Ray waits for three failed checks before it believes that a machine is lost: by default that takes 12 seconds or
     # more, and streams wait for it.
-    "RAY_health_check_period_ms": "500",
+    "RAY_health_check_period_ms": "300",
     "RAY_health_check_timeout_ms": "1000",
     "RAY_health_check_failure_threshold": "3",
     # Serve's own log goes to its files only.
