@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ipaddress
 import logging
-import logging.config
 import os
 import signal
 import socket
@@ -19,7 +18,7 @@ from lanestream.api.auth import warn_if_open
 from lanestream.api.server import listen
 from lanestream.errors import LanestreamError, SettingsError, needs_extra, one_line
 from lanestream.host import processors
-from lanestream.logs import flush_logs, log_config
+from lanestream.logs import flush_logs, log_beside_others
 
 with needs_extra("cluster,cpu"):
     import ray
@@ -49,7 +48,7 @@ def up(settings: Settings, options: ClusterOptions, address: str | None) -> None
     """
     # Finds what is wrong before Ray starts.
     authenticator = create_app(None, settings).state.service.authenticator
-    logging.config.dictConfig(log_config(settings))
+    log_beside_others(settings)
     if address is None:
         settings = _check_machine(settings, options)
     with _stop_signals() as stop:

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import logging.config
-from collections.abc import Callable, Collection
+from collections.abc import Awaitable, Callable, Collection
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from lanestream.api.app import create_app
 from lanestream.api.server import start_pool, start_upkeep, tune_process
 from lanestream.cluster.metrics import RayMetrics
 from lanestream.errors import needs_extra
-from lanestream.logs import log_config
+from lanestream.logs import log_beside_others
 
 with needs_extra("cluster"):
     import ray
@@ -47,6 +47,8 @@ _METRICS_S: Final = 5.0
 # How long requests still come that a router sent before it learned that this replica is being stopped.
 SETTLE_S: Final = 1.0
 _RETRY_S: Final = 1.0
+# The state of a replica, as Serve's controller shows it.
+_STOPPING: Final = "STOPPING"
 
 
 class Replica:
@@ -56,7 +58,7 @@ class Replica:
     """
 
     def __init__(self, settings: Settings, load: Callable[[], Engine], draw: DrawLanes | None) -> None:
-        logging.config.dictConfig(log_config(settings))
+        log_beside_others(settings)
         self._settings, self._load, self._draw = settings, load, draw
         self._service: Service | None = None
         self._tasks: list[asyncio.Task[None]] = []
@@ -108,36 +110,42 @@ class PeerLoss:
 
 
 class StreamMover:
-    """Moves streams away from this replica, named `own`, when the list of running replicas changes."""
+    """Moves streams away from this replica, named `own`, when the list of running replicas changes.
 
-    def __init__(self, service: Service, own: str) -> None:
+    A replica that is not in the list is being stopped, or Serve's controller has restarted and has not found it again
+    yet. `is_stopping` asks the controller which of the two it is.
+    """
+
+    def __init__(self, service: Service, own: str, is_stopping: Callable[[], Awaitable[bool]]) -> None:
         self._service = service
         self._own = own
-        self._known: frozenset[str] = frozenset()
+        self._is_stopping = is_stopping
+        # Names are never used again.
+        self._seen: frozenset[str] = frozenset()
         self._drain: asyncio.Task[None] | None = None
 
     def update(self, running: Collection[str]) -> None:
-        """Hands over streams to new replicas, and drains the service if this replica has been removed."""
-        before, self._known = self._known, frozenset(running)
-        if self._own not in self._known:
-            if self._own in before:
-                _log.info("this replica is being stopped", extra={"event": "replica_stopping"})
-                self._drain = asyncio.create_task(self._drain_soon())
+        """Hands over streams to new replicas, and drains the service if this replica is being stopped."""
+        new = frozenset(running) - self._seen
+        started = self._own in self._seen
+        self._seen |= new
+        if self._own not in running:
+            if started and self._drain is None:
+                self._drain = asyncio.create_task(self._drain_if_stopping())
             return
         if self._drain is not None:
-            # The list was incomplete: Serve's controller has restarted, and has found this replica again.
             self._drain.cancel()
-            self._drain, self._service.draining = None, False
-        if self._own not in before:  # it is new itself
-            return
-        count = len(self._service.streams) * len(self._known - before) // len(self._known)
-        moved = self._service.hand_over(count)
+            self._drain = None
+        moved = self._service.hand_over(len(self._service.streams) * len(new) // len(running)) if started else 0
         if moved:
             _log.info(
                 "%d streams move to new replicas", moved, extra={"event": "streams_handed_over", "streams": moved}
             )
 
-    async def _drain_soon(self) -> None:
+    async def _drain_if_stopping(self) -> None:
+        while not await self._is_stopping():
+            await asyncio.sleep(_RETRY_S)
+        _log.info("this replica is being stopped", extra={"event": "replica_stopping"})
         await asyncio.sleep(SETTLE_S)
         await self._service.drain()
 
@@ -145,21 +153,35 @@ class StreamMover:
 async def _watch_replicas(service: Service) -> None:
     """Drains the service once Serve stops this replica, and hands over streams when it adds others."""
     context = serve.get_replica_context()
-    mover = StreamMover(service, context.replica_tag)
     key = (LongPollNamespace.DEPLOYMENT_TARGETS, DeploymentID(name=context.deployment, app_name=context.app_name))
-    seen = {key: -1}
+    mover = StreamMover(service, context.replica_tag, partial(_is_stopping, context))
+    snapshots = {key: -1}
     while True:
         try:
-            controller = ray.get_actor(SERVE_CONTROLLER_NAME, namespace=SERVE_NAMESPACE)
-            updates: Any = await controller.listen_for_change.remote(seen)
+            updates = await _controller().listen_for_change.remote(snapshots)
         except (RayError, ValueError):  # the controller is being restarted
             await asyncio.sleep(_RETRY_S)
             continue
         if updates == LongPollState.TIME_OUT:
             continue
         for update in updates.values():
-            seen[key] = update.snapshot_id
+            snapshots[key] = update.snapshot_id
             mover.update([info.replica_id.unique_id for info in update.object_snapshot.running_replicas])
+
+
+async def _is_stopping(context: Any) -> bool:
+    """Returns whether Serve's controller is stopping the replica of this context; False if it does not answer."""
+    try:
+        details = await _controller().get_serve_instance_details.remote()
+    except (RayError, ValueError):
+        return False
+    deployments = details["applications"].get(context.app_name, {}).get("deployments", {})
+    replicas = deployments.get(context.deployment, {}).get("replicas", [])
+    return any(each["replica_id"] == context.replica_tag and each["state"] == _STOPPING for each in replicas)
+
+
+def _controller() -> Any:
+    return ray.get_actor(SERVE_CONTROLLER_NAME, namespace=SERVE_NAMESPACE)
 
 
 async def _export_metrics(service: Service) -> None:

@@ -36,17 +36,27 @@ class FakeService:
 @pytest.fixture
 def service(monkeypatch: pytest.MonkeyPatch) -> FakeService:
     monkeypatch.setattr(replica, "SETTLE_S", 0.0)
+    monkeypatch.setattr(replica, "_RETRY_S", 0.0)
     return FakeService(12)
+
+
+class Controller:
+    """Says whether it is stopping the replica."""
+
+    stopping = True
+
+    async def is_stopping(self) -> bool:
+        return self.stopping
 
 
 async def update(mover: StreamMover, *names: str) -> None:
     mover.update(names)
-    for _ in range(3):
+    for _ in range(5):
         await asyncio.sleep(0)
 
 
 async def test_streams_are_shared_with_new_replicas(service: Any) -> None:
-    mover = StreamMover(service, "a")
+    mover = StreamMover(service, "a", Controller().is_stopping)
     await update(mover)  # it is not ready yet
     await update(mover, "a", "b")  # it is the new one
     assert len(service.streams) == 12
@@ -60,7 +70,7 @@ async def test_streams_are_shared_with_new_replicas(service: Any) -> None:
 
 
 async def test_a_replica_that_is_removed_drains(service: Any) -> None:
-    mover = StreamMover(service, "a")
+    mover = StreamMover(service, "a", Controller().is_stopping)
     await update(mover, "a", "b")
     await update(mover, "b")
     assert (service.draining, service.drains) == (True, 1)
@@ -68,13 +78,19 @@ async def test_a_replica_that_is_removed_drains(service: Any) -> None:
     assert service.drains == 1
 
 
-async def test_a_replica_that_was_missing_for_a_moment_goes_on(service: Any) -> None:
-    mover = StreamMover(service, "a")
+async def test_a_controller_that_restarts_moves_no_stream(service: Any) -> None:
+    controller = Controller()
+    controller.stopping = False
+    mover = StreamMover(service, "a", controller.is_stopping)
     await update(mover, "a", "b")
-    await update(mover, "b")
+    await update(mover)
+    await update(mover, "a")
     await update(mover, "a", "b")
     assert not service.draining
     assert len(service.streams) == 12
+    controller.stopping = True
+    await asyncio.sleep(0)
+    assert not service.draining
 
 
 @pytest.mark.parametrize(
