@@ -51,6 +51,21 @@ class RayCluster:
         psutil.wait_procs(processes, timeout=fakes.WAIT_S)
         return f"http://127.0.0.1:{port}"
 
+    def kill(self, name: str) -> None:
+        """Kills the processes of this cluster whose names begin with `name`."""
+        nodes = [self._cluster.head_node, *self._cluster.worker_nodes]
+        raylets = [psutil.Process(node.all_processes["raylet"][0].process.pid) for node in nodes]
+        found = [
+            process
+            for raylet in raylets
+            for process in raylet.children(recursive=True)
+            if process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+            if " ".join(process.cmdline()).startswith(name)
+        ]
+        assert found, name
+        for process in found:
+            process.kill()
+
     def sessions(self) -> dict[str, float]:
         """Returns the open sessions of each replica, by its name, as Ray's metrics have them."""
         import ray

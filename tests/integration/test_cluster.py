@@ -72,16 +72,15 @@ def check(camera: Camera, lost: int) -> None:
     assert set(late) == {camera.ids}
 
 
-def wait_for_replicas(cluster: RayCluster, count: int) -> None:
-    """Waits until so many replicas run and each has sessions."""
-    end = time.monotonic() + 2 * WAIT_S
+def wait_for_replicas(cluster: RayCluster, count: int, *, each_with_sessions: bool = True) -> None:
+    """Waits until so many replicas run, and no others stop or start."""
+    end = time.monotonic() + WAIT_S
     while True:
-        status = serve.status().applications["lanestream"].deployments["Lanestream"]
-        running = status.replica_states
+        states = serve.status().applications["lanestream"].deployments["Lanestream"].replica_states
         found = {name: value for name, value in cluster.sessions().items() if value}
-        if dict(running) == {"RUNNING": count} and len(found) == count:
+        if dict(states) == {"RUNNING": count} and (len(found) == count or not each_with_sessions):
             return
-        assert time.monotonic() < end, (running, found)
+        assert time.monotonic() < end, (states, found)
         time.sleep(0.5)
 
 
@@ -111,6 +110,21 @@ def test_no_frame_is_lost_when_replicas_come_and_go(cluster: RayCluster, redis_u
             f" {sum(camera.frames - len(camera.answers) for camera in cameras)} without lanes,"
             f" {sum(camera.answers[-1][1] for camera in cameras)} reconnections"
         )
+
+
+def test_a_restart_of_serves_controller_interrupts_no_stream(cluster: RayCluster, redis_url: str) -> None:
+    deploy(redis_url, min_replicas=NODES, max_replicas=NODES)
+    cameras = open_cameras(cluster.urls, NODES)
+    replicas = cluster.sessions().keys()
+    cluster.kill("ray::ServeController")
+    # Serve has found its replicas again, or replaced them, when its status says so.
+    wait_for_replicas(cluster, NODES, each_with_sessions=False)
+    for camera in cameras:
+        camera.wait_for_answers(len(camera.answers) + 10)
+        camera.finish()
+        check(camera, lost=0)
+        assert camera.answers[-1][1] == 0
+    assert cluster.sessions().keys() == replicas
 
 
 def check_that_ray_shows_no_secret(cluster: RayCluster) -> None:
