@@ -6,18 +6,28 @@ import os
 import re
 import signal
 import socket
+import statistics
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import cycle, pairwise
 
+import cv2
 import fakes
 import httpx
+import numpy as np
 import psutil
 import pytest
+from processes import service
 from wsclient import receive, receive_close, send_message, stream
+
+from lanestream_client import LaneClient, SourceFrame
+from lanestream_exporter.scenes import Drive, render_clip, sample_clip
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -123,3 +133,45 @@ def test_replicas_that_cannot_start_say_why() -> None:
     expected = "error: the replicas can't start: no model file at missing.onnx (give the path of "
     assert result.stderr.splitlines()[-1].startswith(expected)
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.skipif("CLUSTER_NODES" not in os.environ, reason="only measures: use `make cluster-check`")
+def test_the_cost_of_ray_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    clip = sample_clip(np.random.default_rng(24), 1280, 720, frames=24, fps=25.0, drive=Drive("highway", fair=True))
+    images = [cv2.imencode(".jpg", frame.image)[1].tobytes() for frame in render_clip(clip)]
+    # One worker process, as a replica with one processor has.
+    with service(processes=1, threads=2, inference_threads=1) as (_, url):
+        measured = {"lanestream serve": measure(url, images)}
+    with cluster_up("--port", "0") as (_, url, _):
+        measured["one replica on Ray"] = measure(url, images)
+    with capsys.disabled():
+        size = statistics.median(map(len, images)) / 1000
+        print(f"\nframes of 1280 x 720, {size:.0f} kB, one worker process:")
+        for name, (rate, median_ms) in measured.items():
+            print(f"{name}: {rate:.1f} frames/s with 4 streams, {median_ms:.1f} ms from frame to reply with one")
+
+
+def measure(url: str, images: list[bytes], seconds: float = 10.0) -> tuple[float, float]:
+    """Returns the frames per second of four streams, and the median milliseconds from frame to reply of one."""
+    end = time.monotonic() + seconds
+    with ThreadPoolExecutor(4) as threads:
+        counts = [len(times) for times in threads.map(lambda _: answer_times(url, images, end, 2), range(4))]
+    alone = answer_times(url, images, time.monotonic() + seconds, 1)
+    return sum(counts) / seconds, 1e3 * statistics.median(after - before for before, after in pairwise(alone))
+
+
+def answer_times(url: str, images: list[bytes], end: float, in_flight: int) -> list[float]:
+    """Streams until `end`, as fast as answers come. Returns when they came."""
+
+    def source() -> Iterator[SourceFrame]:
+        for number, image in enumerate(cycle(images)):
+            if time.monotonic() > end:
+                return
+            yield SourceFrame(number, 0.04 * number, data=image)
+
+    with LaneClient(url, in_flight=in_flight) as client:
+        stream = client.stream(source(), mode="all")
+        times = [time.monotonic() for result in stream if result.lanes is not None]
+        assert stream.summary is not None
+        assert stream.summary.answered == stream.summary.frames == len(times)
+    return times

@@ -9,7 +9,7 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,6 +24,7 @@ with needs_extra("cluster,cpu"):
     import ray
     from ray import serve
     from ray.exceptions import RayError
+    from ray.serve.exceptions import RayServeException
 
     from lanestream.cluster.deployment import application
 
@@ -52,8 +53,8 @@ def up(settings: Settings, options: ClusterOptions, address: str | None) -> None
     if address is None:
         settings = _check_machine(settings, options)
     with _stop_signals() as stop:
-        _connect(address)
         try:
+            _connect(address)
             warn_if_open(authenticator, settings.host, loopback=_is_loopback(settings.host))
             with _deployed(settings, options, local=address is None):
                 stop.began()
@@ -90,7 +91,10 @@ class _Stop:
 @contextmanager
 def _stop_signals() -> Iterator[_Stop]:
     stop = _Stop()
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    handled = [signal.SIGINT, signal.SIGTERM]
+    # A terminal that is closed sends it. A process that was started to ignore it, by nohup, goes on.
+    handled += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else []
+    before = {number: signal.signal(number, stop) for number in handled}
     try:
         yield stop
     finally:
@@ -124,7 +128,7 @@ def _connect(address: str | None) -> None:
         if address is not None:
             _check_reachable(address)
         ray.init(address or "local", logging_level=logging.ERROR, **local)
-    except (OSError, OverflowError, RuntimeError, ValueError) as error:
+    except (OSError, OverflowError, RayError, RuntimeError, ValueError) as error:
         where = f"can't use the Ray cluster at {address}" if address else "can't start Ray"
         raise SettingsError(
             f"{where}: {one_line(error)}", "give the address that `ray start` printed" if address else ""
@@ -153,16 +157,16 @@ def _deployed(settings: Settings, options: ClusterOptions, *, local: bool) -> It
             http = {"host": settings.host, "port": settings.port}
             serve.start(proxy_location="EveryNode", http_options=http, logging_config=quiet)
         _log.info("starting replicas, at first %d, and loading the networks", options.min_replicas)
-        try:
-            serve.run(application(settings, options), name=_APPLICATION, route_prefix="/", logging_config=quiet)
-        except RuntimeError as error:
-            raise _start_failure(error) from None
+        serve.run(application(settings, options), name=_APPLICATION, route_prefix="/", logging_config=quiet)
         for url in _urls(settings, started=status is None):
             _log.info("ready at %s", url, extra={"event": "ready", "url": url})
         yield
+    except (RayError, RuntimeError, TimeoutError, ValueError) as error:
+        raise _start_failure(error) from None
     finally:
         _log.info("draining the replicas")
-        serve.delete(_APPLICATION)
+        with suppress(RayError, RayServeException):
+            serve.delete(_APPLICATION)
         if status is None and not local:
             serve.shutdown()
 
@@ -194,9 +198,14 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _start_failure(error: RuntimeError) -> LanestreamError:
+def _start_failure(error: Exception) -> LanestreamError:
     """Returns why the replicas can't start: the last line of the traceback that Serve has of one of them."""
-    application = serve.status().applications.get(_APPLICATION)
+    with suppress(RayError, RayServeException):
+        return _failure(error, serve.status().applications.get(_APPLICATION))
+    return _failure(error, None)
+
+
+def _failure(error: Exception, application: Any) -> LanestreamError:
     messages = [] if application is None else [each.message for each in application.deployments.values()]
     lines = [line.strip() for line in "\n".join([str(error), *messages]).splitlines() if line.strip()]
     found = [line.partition(": ")[2] for line in lines if line.startswith("lanestream.errors.")]
