@@ -29,7 +29,7 @@ GPU_READY := $(GPU_VENV)/.ready
 JS_READY := client/js/node_modules/.ready
 JS_BUILT := client/js/dist/index.js
 
-.PHONY: attack batch-ray batch-speed bench gpu-check soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up compose-ready down up-check clean js js-types
+.PHONY: attack batch-speed bench cluster-check gpu-check ray-test soak evaluate evaluate-tracking ablation models demo serve train-toy test lint lock asyncapi asyncapi-check chart fuzz picture moving-picture image image-test up compose-ready down up-check clean js js-types
 
 demo: $(RUN_READY)
 	$(BIN)/python tools/demo.py $(if $(VIDEO),"$(VIDEO)")
@@ -134,10 +134,17 @@ gpu-check: $(GPU_READY)
 batch-speed: $(DEV_READY)
 	$(BIN)/python tools/batch_speed.py $(ARGS)
 
-# Tests `lanestream batch --ray` on a cluster of three nodes on this machine. Ray is large, so only this installs it.
-batch-ray: $(DEV_READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ray]'
-	$(BIN)/python -m pytest tests/integration/test_batch_ray.py
+CLUSTER_TESTS := $(addprefix tests/,integration/test_cluster.py integration/test_cluster_up.py unit/service/cluster unit/deploy/test_kuberay.py)
+
+# Installs Ray, which is large, and tests what needs it on clusters of two and three nodes on this machine.
+ray-test: $(DEV_READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ray,cluster]'
+	$(BIN)/python -m pytest tests/integration/test_batch_ray.py $(CLUSTER_TESTS)
+
+# Tests the service on a Ray cluster of three nodes on this machine, with 24 streams, and prints what it measured.
+cluster-check: $(DEV_READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[cluster]'
+	CLUSTER_NODES=3 CLUSTER_STREAMS=24 $(BIN)/python -m pytest $(CLUSTER_TESTS)
 
 # Attacks services that it starts on 127.0.0.1, and prints what normal cameras felt. Needs redis-server and faketime.
 attack: $(DEV_READY)
@@ -175,8 +182,8 @@ BUILD_REQUIREMENTS := import tomllib; print(*tomllib.load(open("pyproject.toml",
 # Locks the packages of the images, and those that build our own: the newest versions that pyproject.toml allows.
 lock: | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(LOCK) --extra service --extra cpu --extra openvino --extra cluster --extra tracing -o docker/requirements-cpu.txt pyproject.toml
-	$(LOCK) --extra service --extra gpu --extra cluster --extra tracing -o docker/requirements-gpu.txt pyproject.toml
+	$(LOCK) --extra service --extra cpu --extra openvino --extra redis --extra tracing -o docker/requirements-cpu.txt pyproject.toml
+	$(LOCK) --extra service --extra gpu --extra redis --extra tracing -o docker/requirements-gpu.txt pyproject.toml
 	$(BIN)/python -c '$(BUILD_REQUIREMENTS)' | $(LOCK) -o docker/requirements-build.txt -
 
 .PHONY: docs docs-serve
@@ -231,7 +238,7 @@ $(RUN_READY): pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 $(DEV_READY): pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,cluster,train,bench,docs,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[service,cpu,openvino,redis,train,bench,docs,dev]'
 	@touch $@ $(RUN_READY)
 
 $(GPU_READY): pyproject.toml

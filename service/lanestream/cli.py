@@ -39,11 +39,10 @@ _EXIT_TERMINATED: Final = 143
 _ENGINE_BYTES: Final = 600e6
 # The extra that the commands of this package need when they run.
 _SERVICE_EXTRA: Final = "service,cpu"
+_CLUSTER_EXTRA: Final = "cluster,cpu"
 
 # Each entry point of this group is a mapping from a command's name to the fields of a MountedCommand.
 _COMMANDS_GROUP: Final = "lanestream.commands"
-# An entry point of this group is a function that draws a `lanes` message on an image.
-_OVERLAYS_GROUP: Final = "lanestream.overlays"
 
 
 @dataclass(frozen=True)
@@ -142,6 +141,33 @@ _REGRESSOR: Final = click.option(
 )
 
 
+def _service_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the options for the most used settings of the service, in the order of this list."""
+    options = (
+        click.option("--config", type=click.Path(path_type=Path), help="TOML file with settings."),
+        click.option("--host", help="Address to listen on  [default: 127.0.0.1]"),
+        click.option(
+            "--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]"
+        ),
+        _MODEL,
+        _REGRESSOR,
+        click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="Execution provider  [default: auto]"),
+        click.option(
+            "--max-sessions", type=click.IntRange(1), help="Maximum number of concurrent streams  [default: 64]"
+        ),
+        click.option(
+            "--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 per line."
+        ),
+        click.option("--log-format", type=click.Choice(["text", "json"]), help="Log format  [default: text]"),
+        click.option(
+            "--log-level", type=click.Choice(["debug", "info", "warning", "error"]), help="Log level  [default: info]"
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, message="lanestream %(version)s")
 @click.pass_context
@@ -151,20 +177,9 @@ def cli(context: click.Context) -> None:
 
 
 @cli.command()
-@click.option("--config", type=click.Path(path_type=Path), help="TOML file with settings.")
-@click.option("--host", help="Address to listen on  [default: 127.0.0.1]")
-@click.option("--port", type=click.IntRange(0, 65535), help="Port to listen on, 0 for a free one  [default: 8000]")
-@_MODEL
-@_REGRESSOR
-@click.option("--provider", type=click.Choice(PROVIDER_NAMES), help="Execution provider  [default: auto]")
-@click.option("--max-sessions", type=click.IntRange(1), help="Maximum number of concurrent streams  [default: 64]")
-@click.option("--api-keys-file", type=click.Path(path_type=Path), help="File of API keys, one NAME:SHA256 per line.")
+@_service_options
 @click.option("--tls-certificate", type=click.Path(path_type=Path), help="PEM file of the certificate for https.")
 @click.option("--tls-key", type=click.Path(path_type=Path), help="PEM file of its private key, if it is another file.")
-@click.option("--log-format", type=click.Choice(["text", "json"]), help="Log format  [default: text]")
-@click.option(
-    "--log-level", type=click.Choice(["debug", "info", "warning", "error"]), help="Log level  [default: info]"
-)
 @click.option("--open", "open_page", is_flag=True, help="Open the live page in a browser once the service is ready.")
 @click.option("--print-config", is_flag=True, help="Print all settings with secrets masked, and exit.")
 def serve(*, open_page: bool, print_config: bool, **options: Any) -> None:
@@ -172,12 +187,13 @@ def serve(*, open_page: bool, print_config: bool, **options: Any) -> None:
 
     Every setting can also be given as LANESTREAM_<NAME>, or in the file of --config. --print-config lists them all.
     """
+    from lanestream.api.overlay import installed_overlay
     from lanestream.api.server import serve as run
     from lanestream.engine import load_engine, resolve_regressor
     from lanestream.settings import load_settings, to_toml
 
     # Last: OpenCV reads its pixel limit when it is first imported, and the service's modules set that limit before.
-    draw_lanes = _load_overlay()
+    draw_lanes = installed_overlay()
     settings = load_settings(**options)
     if print_config:
         click.echo(to_toml(settings))
@@ -187,6 +203,59 @@ def serve(*, open_page: bool, print_config: bool, **options: Any) -> None:
     regressor = resolve_regressor(settings.regressor)
     load = partial(load_engine, settings.model, settings.provider, regressor, settings.runtime_options)
     run(settings, load, draw_lanes, _open_in_browser if open_page else None)
+
+
+@cli.group()
+def cluster() -> None:
+    """Run the service on a Ray cluster."""
+
+
+@cluster.command()
+@click.option("--address", help="Ray cluster to use, such as 10.0.0.1:6379 or auto  [default: start one here]")
+@click.option(
+    "--replicas", metavar="N|MIN..MAX", default="1", show_default=True, help="Number of replicas, or its range."
+)
+@click.option(
+    "--sessions-per-replica",
+    type=click.IntRange(1),
+    help="With more streams per replica than this, replicas are added  [default: 4]",
+)
+@click.option("--cpus", type=click.FloatRange(0.0, min_open=True), help="Processors of a replica  [default: 1]")
+@click.option("--gpus", type=click.FloatRange(0.0), help="GPUs of a replica  [default: 0]")
+@_service_options
+def up(
+    *,
+    address: str | None,
+    replicas: str,
+    sessions_per_replica: int | None,
+    cpus: float | None,
+    gpus: float | None,
+    **options: Any,
+) -> None:
+    """Serve on a Ray cluster until Ctrl-C.
+
+    Every setting of `serve` can also be given as LANESTREAM_<NAME>, or in the file of --config. More than one replica
+    needs LANESTREAM_REDIS_URL.
+    """
+    with needs_extra(_CLUSTER_EXTRA):
+        from lanestream.cluster.options import ClusterOptions, check_settings, parse_replicas
+        from lanestream.cluster.ray_variables import set_ray_variables
+        from lanestream.settings import load_settings
+
+    try:
+        least, most = parse_replicas(replicas)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}.", param_hint="'--replicas'") from None
+    given = {"sessions_per_replica": sessions_per_replica, "cpus": cpus, "gpus": gpus}
+    values = {name: value for name, value in given.items() if value is not None}
+    cluster_options = ClusterOptions.parse({"min_replicas": least, "max_replicas": most, **values})
+    settings = load_settings(**options)
+    check_settings(settings, cluster_options)
+    set_ray_variables()
+    with needs_extra(_CLUSTER_EXTRA):
+        # Takes seconds.
+        from lanestream.cluster.launcher import up as run
+    run(settings, cluster_options, address)
 
 
 @cli.command()
@@ -279,14 +348,6 @@ def _terminate(*_: object) -> None:
     While the service runs, uvicorn's handler replaces this one.
     """
     os._exit(_EXIT_TERMINATED)
-
-
-def _load_overlay() -> Callable[..., Any] | None:
-    """Returns the installed function that draws lanes on an image, or None if there is none."""
-    for entry_point in entry_points(group=_OVERLAYS_GROUP):
-        draw: Callable[..., Any] = entry_point.load()
-        return draw
-    return None
 
 
 if __name__ == "__main__":

@@ -27,6 +27,8 @@ from pythonjsonlogger.json import JsonFormatter
 if TYPE_CHECKING:
     from lanestream.settings import Settings
 
+# The logger above all loggers of this package.
+_OWN: Final = "lanestream"
 _NAMES: Final = {"levelname": "level", "name": "logger", "exc_info": "exception", "stack_info": "stack"}
 _TIME: Final = "time"
 _CONTEXT: Final = ("session", "seq", "request_id", "trace_id")
@@ -236,21 +238,39 @@ def log_config(settings: Settings) -> dict[str, Any]:
         },
         "root": {"handlers": ["stderr"], "level": "WARNING"},
         "loggers": {
-            "lanestream": {"level": level.upper()},
+            _OWN: {"level": level.upper()},
             "uvicorn": {"level": library_level.upper()},
         },
     }
 
 
+def log_beside_others(settings: Settings) -> None:
+    """Logs the service's own records like `log_config`, in a process whose other loggers belong to another program.
+
+    `dictConfig` would close the handlers of that program.
+    """
+    handler = BackgroundHandler()
+    handler.setFormatter(TextLogFormatter() if settings.log_format == "text" else JsonLogFormatter())
+    handler.addFilter(QueryRemover())
+    logger = logging.getLogger(_OWN)
+    logger.addHandler(handler)
+    logger.setLevel(settings.log_level.upper())
+    logger.propagate = False
+
+
 def dropped_records() -> int:
     """Returns the number of log records that this process has dropped, because standard error was not read in time."""
-    return sum(handler.dropped for handler in logging.getLogger().handlers if isinstance(handler, BackgroundHandler))
+    return sum(handler.dropped for handler in _handlers() if isinstance(handler, BackgroundHandler))
 
 
 def flush_logs() -> None:
     """Waits until queued log records are written, for at most half a second."""
-    for handler in logging.getLogger().handlers:
+    for handler in _handlers():
         handler.flush()
+
+
+def _handlers() -> list[logging.Handler]:
+    return [*logging.getLogger().handlers, *logging.getLogger(_OWN).handlers]
 
 
 def _nonblocking_stderr() -> int:

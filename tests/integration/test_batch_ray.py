@@ -1,4 +1,4 @@
-"""`lanestream batch --ray` on a cluster of three nodes on this machine. Run by `make batch-ray`, which installs Ray."""
+"""`lanestream batch --ray` on a cluster of three nodes on this machine. Run by `make ray-test`, which installs Ray."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from batches import Batch, rows, write_clip
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    cluster_utils = pytest.importorskip("ray.cluster_utils", reason="needs Ray: use `make batch-ray`")
+    cluster_utils = pytest.importorskip("ray.cluster_utils", reason="needs Ray: use `make ray-test`")
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 

@@ -52,6 +52,7 @@ NOT_RUN = [
     ("docs/client.md", "import asyncio*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import cv2*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import rerun*", "tests/integration/test_clients.py"),
+    ("docs/cluster.md", "*", "needs Ray; tests/integration/test_cluster.py and tests/integration/test_cluster_up.py"),
     ("docs/deployment.md", "make up*", DOCKER),
     ("docs/deployment.md", "apt install *", DOCKER),
     ("docs/deployment.md", "pipx install *", DOCKER),
@@ -92,7 +93,7 @@ PRINTED = {
     "import { readFile }*": "type: 'lanes'",
 }
 # Blocks in these languages are data or belong to other programs.
-NOT_CODE = {"caddyfile", "haproxy", "html", "json", "nginx", "text", "toml", "yaml"}
+NOT_CODE = {"caddyfile", "dockerfile", "haproxy", "html", "json", "nginx", "text", "toml", "yaml"}
 # Commands that are safe to run. Others must be listed above.
 SAFE = {"curl", "head", "lanestream", "make"}
 # With Node 20 `WebSocket` is an option.

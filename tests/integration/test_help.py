@@ -76,7 +76,8 @@ def test_every_command_has_help(hidden: list[str]) -> None:
     result = run(EVERY_HELP, hidden)
     assert result.returncode == 0, result.stderr
     helps = json.loads(result.stdout)
-    assert {"", "serve", "models", "stream", "train classifier", "evaluate tracking", "data check"} <= set(helps)
+    expected = {"", "serve", "cluster up", "models", "stream", "train classifier", "evaluate tracking", "data check"}
+    assert expected <= set(helps)
     for path, text in helps.items():
         assert text.startswith(f"Usage: cli {path}".rstrip()), f"{path}: {text}"
 
@@ -85,6 +86,7 @@ def test_every_command_has_help(hidden: list[str]) -> None:
     ("arguments", "extra"),
     [
         ("serve", "service,cpu"),
+        ("cluster up", "cluster,cpu"),
         ("doctor", "service,cpu"),
         ("models", "service,cpu"),
         ("detect x.jpg", "service,cpu"),

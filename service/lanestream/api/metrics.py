@@ -217,6 +217,10 @@ class Metrics:
         """Reports the worker processes; `pids` returns their process ids."""
         self._registry.register(WorkerCollector(pids))
 
+    def collect(self) -> Iterable[Metric]:
+        """Returns all metrics with their current values."""
+        return self._registry.collect()
+
     def exposition(self) -> bytes:
         """Returns all metrics in Prometheus' text format, media type `MEDIA_TYPE`."""
         return generate_latest(self._registry)

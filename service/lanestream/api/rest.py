@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Iterator, Sequence
 from http import HTTPStatus
@@ -18,7 +17,6 @@ from lanestream.api.request_id import add_trace, current_request_id
 from lanestream.api.service import Service
 from lanestream.errors import NotAcceptableError, ProtocolError, one_line
 from lanestream.images.decoding import decode
-from lanestream.logs import dropped_records
 from lanestream.messages import lanes_message
 from lanestream.protocol import (
     BoundaryKind,
@@ -324,13 +322,7 @@ async def readyz(request: Request) -> Readiness:
 async def exposition(request: Request) -> Response:
     """Returns the metrics in Prometheus' text format."""
     service = _service(request)
-    service.metrics.sample(
-        tasks=len(asyncio.all_tasks()),
-        connections=len(service.connections),
-        buffered=service.budget.used,
-        store_reachable=service.sessions.store_reachable,
-        log_drops=dropped_records(),
-    )
+    service.sample_metrics()
     return Response(service.metrics.exposition(), headers={"content-type": MEDIA_TYPE})
 
 

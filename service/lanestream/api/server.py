@@ -11,7 +11,7 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import FrameType
@@ -67,16 +67,21 @@ def serve(
     must be able to import it. `on_ready` is called once frames can be processed, in a thread, with a URL that reaches
     the service from this machine. Raises SettingsError if the address can't be listened on, and any error of `load`.
     """
-    # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
-    cv2.setNumThreads(settings.opencv_threads)
-    # Images and messages of a few megabytes come and go, and must not add up.
-    keep_freed_memory(_LARGEST_KEPT_BYTES)
+    tune_process(settings)
     app = create_app(None, settings, draw)
     listener = listen(settings.host, settings.port)
     server = LanestreamServer(app, settings)
     app.state.service.connections.fit(raise_open_files() - _OTHER_FILES)
     with server.stopping_on_signals(), asyncio.Runner(loop_factory=server.config.get_loop_factory()) as runner:
         runner.run(_serve(server, listener, app, load, on_ready))
+
+
+def tune_process(settings: Settings) -> None:
+    """Sets how this process uses processors and memory; to be called before it gets its first image."""
+    # Frames already run in parallel; OpenCV's own threads would compete with them for the processors.
+    cv2.setNumThreads(settings.opencv_threads)
+    # Images and messages of a few megabytes come and go, and must not add up.
+    keep_freed_memory(_LARGEST_KEPT_BYTES)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -120,12 +125,10 @@ class LanestreamServer(uvicorn.Server):
         )
         super().__init__(server_config(app, settings, self.certificate))
         self._service: Service = app.state.service
-        self.watches: list[FileWatch] = []
-        if settings.api_keys_file is not None:
-            self.watches.append(FileWatch([settings.api_keys_file], self._service.reload_keys))
+        self.watches = watched_keys(self._service)
         if self.certificate is not None:
             self.watches.append(FileWatch(self.certificate.files, self.certificate.reload))
-        self.reload_requested = False
+        self._reload_requested = False
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -144,7 +147,7 @@ class LanestreamServer(uvicorn.Server):
 
         def stop(number: int, _: FrameType | None) -> None:
             if number == signal.SIGHUP and self.watches:
-                self.reload_requested = True
+                self._reload_requested = True
                 return
             if received and number != signal.SIGHUP:
                 flush_logs()
@@ -166,6 +169,11 @@ class LanestreamServer(uvicorn.Server):
                 signal.signal(number, handler)
         if received and received[0] != signal.SIGINT:
             signal.raise_signal(received[0])
+
+    def take_reload_request(self) -> bool:
+        """Returns whether SIGHUP has asked for the files of keys and certificates since the last call."""
+        requested, self._reload_requested = self._reload_requested, False
+        return requested
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drains the streams, then shuts uvicorn down, which closes the sockets."""
@@ -190,7 +198,7 @@ async def _serve(
     scheme = "http" if server.certificate is None else "https"
     url = _http_url(scheme, host, port)
     _log.info("listening on %s, loading the networks", url, extra={"event": "listening", "url": url})
-    starting = asyncio.create_task(_start_pool(app.state.service, load))
+    starting = asyncio.create_task(start_pool(app.state.service, load))
     await asyncio.wait([starting, serving], return_when=asyncio.FIRST_COMPLETED)
     if not starting.done():  # a signal came first
         starting.cancel()
@@ -222,20 +230,34 @@ async def _serve(
         server.should_exit = True
         await serving
         raise
-    upkeep = [asyncio.create_task(_return_memory())]
-    if server.watches:
-        upkeep.append(asyncio.create_task(_watch_files(server)))
+    upkeep = start_upkeep(server.watches, server.take_reload_request)
     await serving
     for task in upkeep:
         task.cancel()
 
 
-async def _watch_files(server: LanestreamServer) -> None:
-    """Reads the files of API keys and certificates again when they have changed, and when SIGHUP asks for it."""
+def watched_keys(service: Service) -> list[FileWatch]:
+    """Returns what reads the file of API keys again when it has changed; nothing without such a file."""
+    path = service.settings.api_keys_file
+    return [] if path is None else [FileWatch([path], service.reload_keys)]
+
+
+def start_upkeep(watches: Sequence[FileWatch], take_reload_request: Callable[[], bool]) -> list[asyncio.Task[None]]:
+    """Starts the background tasks of a process that serves. Cancel them at its end.
+
+    `take_reload_request` returns whether the files must be read again although they did not change.
+    """
+    tasks = [asyncio.create_task(_return_memory())]
+    if watches:
+        tasks.append(asyncio.create_task(_watch_files(watches, take_reload_request)))
+    return tasks
+
+
+async def _watch_files(watches: Sequence[FileWatch], take_reload_request: Callable[[], bool]) -> None:
     while True:
         await asyncio.sleep(_FILES_POLL_S)
-        requested, server.reload_requested = server.reload_requested, False
-        for watch in server.watches:
+        requested = take_reload_request()
+        for watch in watches:
             watch.check(await asyncio.to_thread(watch.versions), force=requested)
 
 
@@ -256,7 +278,7 @@ async def _return_memory() -> None:
         return_freed_memory()
 
 
-async def _start_pool(service: Service, load: Callable[[], Engine]) -> WorkerPool:
+async def start_pool(service: Service, load: Callable[[], Engine]) -> WorkerPool:
     """Returns a warm worker pool: worker processes, or threads of this process if the settings ask for that."""
     settings, metrics = service.settings, service.metrics
     if settings.processes == 0:

@@ -20,6 +20,7 @@ from lanestream.api.request_body import BodyLimits, BodyReader
 from lanestream.api.tracing import open_tracer
 from lanestream.asyncapi import document
 from lanestream.errors import DrainingError, NotReadyError, SettingsError
+from lanestream.logs import dropped_records
 from lanestream.protocol import Limits, json_schemas, read_camera_file
 from lanestream.session import SessionOptions
 from lanestream.streaming.session_registry import SessionRegistry
@@ -52,6 +53,12 @@ class OpenStream(Protocol):
 
     def wake(self) -> None:
         """Makes the stream check whether it must end: the service may be draining, or the caller's key be gone."""
+
+    def hand_over(self) -> bool:
+        """Ends the stream as a drain does, so that its client resumes it on another replica.
+
+        Returns False, and changes nothing, if its client could not resume it.
+        """
 
 
 class Service:
@@ -156,6 +163,16 @@ class Service:
         self.metrics.workers(lambda: pool.pids)
         self._pool = pool
 
+    def sample_metrics(self) -> None:
+        """Sets the metrics that are measured when they are read. To be called in the event loop."""
+        self.metrics.sample(
+            tasks=len(asyncio.all_tasks()),
+            connections=len(self.connections),
+            buffered=self.budget.used,
+            store_reachable=self.sessions.store_reachable,
+            log_drops=dropped_records(),
+        )
+
     @contextmanager
     def answering(self, request: HTTPConnection, caller: Caller) -> Iterator[None]:
         """Makes `drain` wait for the request that is answered in the block, and keeps its connection open."""
@@ -170,6 +187,15 @@ class Service:
             self._requests -= 1
             if connection is not None:
                 connection.unprotect()
+
+    def hand_over(self, count: int) -> int:
+        """Makes up to `count` streams continue on other replicas, and returns how many."""
+        handed_over = 0
+        for stream in tuple(self.streams):
+            if handed_over >= count:
+                break
+            handed_over += stream.hand_over()
+        return handed_over
 
     async def drain(self) -> None:
         """Accepts nothing new, notifies the streams and waits until every frame that was accepted is answered.

@@ -93,6 +93,7 @@ class StreamConnection:
         self._received = asyncio.Event()
         self._wake_watcher = asyncio.Event()
         self._evicted = False
+        self._handed_over = False
         self._closed = self._close_counted = False
         self._worker_losses = 0
         self._answered_at_loss = 0
@@ -104,6 +105,14 @@ class StreamConnection:
     def wake(self) -> None:
         """Makes the watcher check the time limits, and whether the stream must end."""
         self._wake_watcher.set()
+
+    def hand_over(self) -> bool:
+        """See OpenStream. Only a client that has a resume token can resume its session."""
+        if self._handed_over or self._session is None or self._session.token is None:
+            return False
+        self._handed_over = True
+        self.wake()
+        return True
 
     async def run(self) -> None:
         """Serves the stream until either side ends it."""
@@ -342,7 +351,7 @@ class StreamConnection:
 
     async def _watch(self) -> None:
         """Raises the error that ends an idle, too old, evicted or no longer allowed stream. Announces a drain."""
-        while not self._service.draining:
+        while not (self._service.draining or self._handed_over):
             try:
                 async with asyncio.timeout(max(self._seconds_to_next_limit(), _MIN_WATCH_S)):
                     await self._wake_watcher.wait()

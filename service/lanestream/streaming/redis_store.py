@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from lanestream.errors import SettingsError, StoreError, needs_extra, one_line
 from lanestream.streaming.store import MemoryStore, TakenSession
 
-with needs_extra("cluster"):
+with needs_extra("redis"):
     from redis.asyncio import Redis
     from redis.asyncio.retry import Retry
     from redis.backoff import ExponentialBackoff
