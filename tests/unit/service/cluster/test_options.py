@@ -48,6 +48,8 @@ def test_more_than_one_replica_needs_redis() -> None:
     check_settings(Settings(redis_url=SecretStr("redis://x")), two)
     with pytest.raises(SettingsError, match="more than one replica needs Redis"):
         check_settings(Settings(), two)
+    with pytest.raises(SettingsError, match="Ray's proxy does not use it"):
+        check_settings(Settings(tls_certificate=Path("certificate.pem")), ClusterOptions())
 
 
 @pytest.mark.parametrize(
