@@ -1,0 +1,113 @@
+"""Service times: what one frame costs a node that has nothing else to do. Everything else is predicted from them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Final
+
+from bench.frames import forward_and_backward
+
+from capacity.nodes import Node
+from lanestream_client import AsyncLaneClient, SourceFrame
+
+_FPS: Final = 4.0
+_IDLE_S: Final = 5.0
+# The first frames search for the horizon and open the session; they are not like the others.
+_SETTLING: Final = 8
+
+
+@dataclass(frozen=True)
+class ServiceTime:
+    """What one frame takes, in seconds.
+
+    `loop_s` is processor time of the service's own process, `worker_s` that of the worker, and `wait_s` the time that
+    the worker waits for a device. `rest_s` is everything else from capture to answer: the network and the client.
+    """
+
+    loop_s: float
+    worker_s: float
+    wait_s: float
+    rest_s: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The service times of frames, in the order of their measurement."""
+
+    frames: tuple[ServiceTime, ...]
+
+    @classmethod
+    def read(cls, path: Path) -> Calibration:
+        """Reads a calibration. Raises ValueError if the file is not one, and OSError."""
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            return cls(tuple(ServiceTime(**each) for each in content["frames"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is not a calibration: {error}") from None
+
+    def with_rest_of(self, other: Calibration) -> Calibration:
+        """Returns these frames with the median rest of another calibration.
+
+        A limit of the processor time stretches everything, so that the rest can only be measured without one.
+        """
+        rest_s = median(each.rest_s for each in other.frames)
+        return Calibration(tuple(replace(each, rest_s=rest_s) for each in self.frames))
+
+    def write(self, path: Path) -> None:
+        """Writes the calibration as JSON, rounded to microseconds."""
+        rows = [{name: round(value, 6) for name, value in asdict(each).items()} for each in self.frames]
+        path.write_text(json.dumps({"frames": rows}) + "\n", encoding="utf-8")
+
+
+def calibrate(node: Node, images: Sequence[bytes], count: int, *, waits: bool) -> Calibration:
+    """Measures `count` frames of one camera that sends few of them to a node without any other load.
+
+    `waits` says that it is a `waiting_node`. Any other node only computes.
+    """
+    return asyncio.run(_Calibrator(node, images, count, waits).run())
+
+
+class _Calibrator:
+    def __init__(self, node: Node, images: Sequence[bytes], count: int, waits: bool) -> None:
+        self._node, self._images, self._waits = node, images, waits
+        self._count = _SETTLING + count
+        # The processor times before each frame, and after the last one.
+        self._cpu: list[tuple[float, float]] = []
+        self._captured: list[float] = []
+        self._frames: list[tuple[float, float]] = []
+
+    async def run(self) -> Calibration:
+        before = self._node.cpu_s()[0]
+        await asyncio.sleep(_IDLE_S)
+        idle = (self._node.cpu_s()[0] - before) / _IDLE_S
+        async with AsyncLaneClient(self._node.url) as client:
+            async for result in client.stream(self._source(), mode="all"):
+                if result.lanes is None:
+                    raise RuntimeError("a frame was not answered during the calibration")
+                wait_s = 1e-3 * result.lanes.timing_ms.fit if self._waits else 0.0
+                self._frames.append((time.monotonic() - self._captured[result.frame.seq], wait_s))
+        return Calibration(tuple(self._service_time(number, idle) for number in range(_SETTLING, self._count)))
+
+    async def _source(self) -> AsyncIterator[SourceFrame]:
+        due = time.monotonic()
+        for seq in range(self._count):
+            due += 1.0 / _FPS
+            await asyncio.sleep(due - time.monotonic())
+            self._cpu.append(self._node.cpu_s())
+            self._captured.append(time.monotonic())
+            yield SourceFrame(seq, self._captured[-1], self._images[forward_and_backward(seq, len(self._images))])
+        await asyncio.sleep(1.0 / _FPS)
+        self._cpu.append(self._node.cpu_s())
+
+    def _service_time(self, number: int, idle: float) -> ServiceTime:
+        (loop, worker), (next_loop, next_worker) = self._cpu[number], self._cpu[number + 1]
+        response, wait_s = self._frames[number]
+        loop_s = max(0.0, next_loop - loop - idle / _FPS)
+        worker_s = next_worker - worker
+        return ServiceTime(loop_s, worker_s, wait_s, max(0.0, response - loop_s - worker_s - wait_s))
