@@ -7,11 +7,13 @@ import json
 import time
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from contextlib import AsyncExitStack
 from pathlib import Path
 from statistics import median
 from typing import Final
 
 from bench.frames import forward_and_backward
+from websockets.asyncio.client import connect
 
 from capacity.nodes import Node
 from lanestream_client import AsyncLaneClient, SourceFrame
@@ -20,6 +22,9 @@ _FPS: Final = 4.0
 _IDLE_S: Final = 5.0
 # The first frames search for the horizon and open the session; they are not like the others.
 _SETTLING: Final = 8
+# Streams that are resumed, to see what that costs, and how long the service then has for what is left to do.
+_OPENED: Final = 40
+_SETTLED_S: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -38,16 +43,20 @@ class ServiceTime:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The service times of frames, in the order of their measurement."""
+    """The service times of frames, in the order of their measurement.
+
+    `open_s` is the processor time that the service's own process needs to resume a stream on a new socket.
+    """
 
     frames: tuple[ServiceTime, ...]
+    open_s: float
 
     @classmethod
     def read(cls, path: Path) -> Calibration:
         """Reads a calibration. Raises ValueError if the file is not one, and OSError."""
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            return cls(tuple(ServiceTime(**each) for each in content["frames"]))
+            return cls(tuple(ServiceTime(**each) for each in content["frames"]), content["open_s"])
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is not a calibration: {error}") from None
 
@@ -57,12 +66,12 @@ class Calibration:
         A limit of the processor time stretches everything, so that the rest can only be measured without one.
         """
         rest_s = median(each.rest_s for each in other.frames)
-        return Calibration(tuple(replace(each, rest_s=rest_s) for each in self.frames))
+        return replace(self, frames=tuple(replace(each, rest_s=rest_s) for each in self.frames))
 
     def write(self, path: Path) -> None:
         """Writes the calibration as JSON, rounded to microseconds."""
         rows = [{name: round(value, 6) for name, value in asdict(each).items()} for each in self.frames]
-        path.write_text(json.dumps({"frames": rows}) + "\n", encoding="utf-8")
+        path.write_text(json.dumps({"open_s": round(self.open_s, 6), "frames": rows}) + "\n", encoding="utf-8")
 
 
 def calibrate(node: Node, images: Sequence[bytes], count: int, *, waits: bool) -> Calibration:
@@ -71,6 +80,28 @@ def calibrate(node: Node, images: Sequence[bytes], count: int, *, waits: bool) -
     `waits` says that it is a `waiting_node`. Any other node only computes.
     """
     return asyncio.run(_Calibrator(node, images, count, waits).run())
+
+
+async def measure_open_s(node: Node) -> float:
+    """Returns the processor time that the service's own process needs to resume a stream, in seconds."""
+    tokens = []
+    async with AsyncExitStack() as sockets:
+        for _ in range(_OPENED):
+            tokens.append(await _open_stream(node, sockets, {"type": "start"}))
+    await asyncio.sleep(_SETTLED_S)
+    before = node.cpu_s()[0]
+    async with AsyncExitStack() as sockets:
+        for token in tokens:
+            await _open_stream(node, sockets, {"type": "start", "resume_token": token})
+        await asyncio.sleep(_SETTLED_S)
+        return (node.cpu_s()[0] - before) / _OPENED
+
+
+async def _open_stream(node: Node, sockets: AsyncExitStack, start: dict[str, str]) -> str:
+    """Opens a stream that is closed with the other `sockets`, and returns its resume token."""
+    socket = await sockets.enter_async_context(connect(f"{node.url.replace('http', 'ws', 1)}/v1/stream"))
+    await socket.send(json.dumps(start))
+    return str(json.loads(await socket.recv())["resume_token"])
 
 
 class _Calibrator:
@@ -92,7 +123,8 @@ class _Calibrator:
                     raise RuntimeError("a frame was not answered during the calibration")
                 wait_s = 1e-3 * result.lanes.timing_ms.fit if self._waits else 0.0
                 self._frames.append((time.monotonic() - self._captured[result.frame.seq], wait_s))
-        return Calibration(tuple(self._service_time(number, idle) for number in range(_SETTLING, self._count)))
+        times = tuple(self._service_time(number, idle) for number in range(_SETTLING, self._count))
+        return Calibration(times, await measure_open_s(self._node))
 
     async def _source(self) -> AsyncIterator[SourceFrame]:
         due = time.monotonic()

@@ -61,7 +61,9 @@ class Outcome:
 
 def outcome(frames: Sequence[FrameLife], start: float, end: float) -> Outcome:
     """Returns the outcome of the time from `start` to `end`. Raises ValueError if nothing was answered in it."""
-    responses = [1e3 * frame.response_s for frame in frames if frame.answered is not None and start <= frame.answered < end]
+    responses = [
+        1e3 * frame.response_s for frame in frames if frame.answered is not None and start <= frame.answered < end
+    ]
     captured = [frame for frame in frames if start <= frame.captured < end]
     if not responses or not captured:
         raise ValueError("no frame was answered")

@@ -55,9 +55,7 @@ def cases() -> list[Case]:
         "real": (Load(2, 4.0), Load(3, 4.0), Load(6, 4.0), closed),
         "waiting": (Load(2, 10.0), Load(3, 10.0), Load(5, 10.0), closed),
     }
-    found = [
-        Case(engine, nodes, load) for nodes in (1, 2, 3) for engine, each in loads.items() for load in each
-    ]
+    found = [Case(engine, nodes, load) for nodes in (1, 2, 3) for engine, each in loads.items() for load in each]
     return [*found, *(Case("waiting", nodes, Load(2, 5.0), loss=True) for nodes in (2, 3))]
 
 
@@ -166,7 +164,10 @@ class Measurement:
             process.kill()
         if lost_at is not None:
             return {"case": case.name, "repeat": repeat, "resumed_s": resume_times(report, lost_at, len(nodes))}
-        used = [(after[0] - then[0], after[1] - then[1]) for then, after in zip(cpu, (node.cpu_s() for node in nodes), strict=True)]
+        used = [
+            (after[0] - then[0], after[1] - then[1])
+            for then, after in zip(cpu, (node.cpu_s() for node in nodes), strict=True)
+        ]
         answered = sum(frame.answered is not None for frame in report.frames)
         start = report.began + _WARM_UP_S
         counts = _RedisCounts.read(redis_url)

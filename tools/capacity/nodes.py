@@ -48,7 +48,7 @@ class Node:
 
     def cpu_s(self) -> tuple[float, float]:
         """Returns the processor time so far: of the service's own process, and of its workers."""
-        return _cpu_s(self._process.pid), sum(_cpu_s(worker.pid) for worker in self._workers)
+        return process_cpu_s(self._process.pid), sum(process_cpu_s(worker.pid) for worker in self._workers)
 
     def kill(self) -> None:
         """Kills the service and its workers at once, as the loss of a machine does."""
@@ -60,7 +60,7 @@ class Node:
         psutil.wait_procs(self._workers)
 
 
-def _cpu_s(pid: int) -> float:
+def process_cpu_s(pid: int) -> float:
     """Returns the processor time of a process and its threads, in seconds, to the nanosecond."""
     total = 0
     for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
