@@ -6,8 +6,8 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator, Sequence
-from dataclasses import asdict, dataclass, replace
 from contextlib import AsyncExitStack
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Final
@@ -22,9 +22,10 @@ _FPS: Final = 4.0
 _IDLE_S: Final = 5.0
 # The first frames search for the horizon and open the session; they are not like the others.
 _SETTLING: Final = 8
-# Streams that are resumed, to see what that costs, and how long the service then has for what is left to do.
+# Streams that are resumed and then saved once a second, to see what that costs.
 _OPENED: Final = 40
 _SETTLED_S: Final = 0.5
+_SAVED_S: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -45,20 +46,31 @@ class ServiceTime:
 class Calibration:
     """The service times of frames, in the order of their measurement.
 
-    `open_s` is the processor time that the service's own process needs to resume a stream on a new socket.
+    `open_s` and `save_s` are processor time of the service's own process: to resume a stream on a new socket, and to
+    save a session.
     """
 
     frames: tuple[ServiceTime, ...]
     open_s: float
+    save_s: float
 
     @classmethod
     def read(cls, path: Path) -> Calibration:
         """Reads a calibration. Raises ValueError if the file is not one, and OSError."""
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            return cls(tuple(ServiceTime(**each) for each in content["frames"]), content["open_s"])
+            return cls(tuple(ServiceTime(**each) for each in content["frames"]), content["open_s"], content["save_s"])
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is not a calibration: {error}") from None
+
+    @property
+    def network_s(self) -> float:
+        """The delay in one direction, in seconds: half of the rest, most of which is the client in fact."""
+        return median(each.rest_s for each in self.frames) / 2.0
+
+    def on_device(self, wait_s: float) -> Calibration:
+        """Returns the same frames on a device: the workers wait for `wait_s` seconds instead of computing."""
+        return replace(self, frames=tuple(replace(each, worker_s=0.0, wait_s=wait_s) for each in self.frames))
 
     def with_rest_of(self, other: Calibration) -> Calibration:
         """Returns these frames with the median rest of another calibration.
@@ -71,7 +83,8 @@ class Calibration:
     def write(self, path: Path) -> None:
         """Writes the calibration as JSON, rounded to microseconds."""
         rows = [{name: round(value, 6) for name, value in asdict(each).items()} for each in self.frames]
-        path.write_text(json.dumps({"open_s": round(self.open_s, 6), "frames": rows}) + "\n", encoding="utf-8")
+        content = {"open_s": round(self.open_s, 6), "save_s": round(self.save_s, 6), "frames": rows}
+        path.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
 def calibrate(node: Node, images: Sequence[bytes], count: int, *, waits: bool) -> Calibration:
@@ -82,19 +95,22 @@ def calibrate(node: Node, images: Sequence[bytes], count: int, *, waits: bool) -
     return asyncio.run(_Calibrator(node, images, count, waits).run())
 
 
-async def measure_open_s(node: Node) -> float:
-    """Returns the processor time that the service's own process needs to resume a stream, in seconds."""
-    tokens = []
+async def measure_sessions(node: Node, idle: float) -> tuple[float, float]:
+    """Returns the processor time of the service's own process to resume a stream, and to save a session, in seconds.
+
+    `idle` is its processor time per second without any stream. A stream without frames is saved once a second.
+    """
     async with AsyncExitStack() as sockets:
-        for _ in range(_OPENED):
-            tokens.append(await _open_stream(node, sockets, {"type": "start"}))
+        tokens = [await _open_stream(node, sockets, {"type": "start"}) for _ in range(_OPENED)]
     await asyncio.sleep(_SETTLED_S)
-    before = node.cpu_s()[0]
     async with AsyncExitStack() as sockets:
+        before = node.cpu_s()[0]
         for token in tokens:
             await _open_stream(node, sockets, {"type": "start", "resume_token": token})
-        await asyncio.sleep(_SETTLED_S)
-        return (node.cpu_s()[0] - before) / _OPENED
+        opened = node.cpu_s()[0]
+        await asyncio.sleep(_SAVED_S)
+        saved = node.cpu_s()[0]
+    return (opened - before) / _OPENED, (saved - opened - idle * _SAVED_S) / (_OPENED * _SAVED_S)
 
 
 async def _open_stream(node: Node, sockets: AsyncExitStack, start: dict[str, str]) -> str:
@@ -123,8 +139,9 @@ class _Calibrator:
                     raise RuntimeError("a frame was not answered during the calibration")
                 wait_s = 1e-3 * result.lanes.timing_ms.fit if self._waits else 0.0
                 self._frames.append((time.monotonic() - self._captured[result.frame.seq], wait_s))
-        times = tuple(self._service_time(number, idle) for number in range(_SETTLING, self._count))
-        return Calibration(times, await measure_open_s(self._node))
+        open_s, save_s = await measure_sessions(self._node, idle)
+        frames = tuple(self._service_time(number, idle, save_s) for number in range(_SETTLING, self._count))
+        return Calibration(frames, open_s, save_s)
 
     async def _source(self) -> AsyncIterator[SourceFrame]:
         due = time.monotonic()
@@ -137,9 +154,10 @@ class _Calibrator:
         await asyncio.sleep(1.0 / _FPS)
         self._cpu.append(self._node.cpu_s())
 
-    def _service_time(self, number: int, idle: float) -> ServiceTime:
+    def _service_time(self, number: int, idle: float, save_s: float) -> ServiceTime:
         (loop, worker), (next_loop, next_worker) = self._cpu[number], self._cpu[number + 1]
         response, wait_s = self._frames[number]
-        loop_s = max(0.0, next_loop - loop - idle / _FPS)
+        # Frames are so far apart that the session is saved after each.
+        loop_s = max(0.0, next_loop - loop - idle / _FPS - save_s)
         worker_s = next_worker - worker
         return ServiceTime(loop_s, worker_s, wait_s, max(0.0, response - loop_s - worker_s - wait_s))

@@ -73,7 +73,7 @@ class Measurement:
         Raises CpuGroupError, RuntimeError and OSError if that is not possible here.
         """
         (self._out / "runs").mkdir(parents=True, exist_ok=True)
-        self._load_images()
+        self._images = [path.read_bytes() for path in sorted(load_frames(self._frames).glob("*.jpg"))]
         for engine in sorted({case.engine for case in selected}):
             if not self.calibration_path(engine).exists():
                 self._calibrate(engine)
@@ -95,13 +95,6 @@ class Measurement:
 
     def _run_path(self, case: Case, repeat: int) -> Path:
         return self._out / "runs" / f"{case.name}-{repeat}.json"
-
-    def _load_images(self) -> None:
-        self._frames.mkdir(exist_ok=True)
-        if not any(self._frames.glob("*.jpg")):
-            for number, image in enumerate(load_clips((LARGE,), _IMAGES)[LARGE]):
-                (self._frames / f"{number:03}.jpg").write_bytes(image)
-        self._images = [path.read_bytes() for path in sorted(self._frames.glob("*.jpg"))]
 
     def _setup(self, engine: Engine) -> NodeSetup:
         if engine == "real":
@@ -181,6 +174,15 @@ class Measurement:
             "redis_us_per_save": (counts.save_us - before.save_us) / max(1, counts.saves - before.saves),
             "redis_bytes_per_save": (counts.bytes_in - before.bytes_in) / max(1, counts.saves - before.saves),
         }
+
+
+def load_frames(folder: Path) -> Path:
+    """Returns `folder`, with the JPEG files of a rendered drive, which it writes if there are none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not any(folder.glob("*.jpg")):
+        for number, image in enumerate(load_clips((LARGE,), _IMAGES)[LARGE]):
+            (folder / f"{number:03}.jpg").write_bytes(image)
+    return folder
 
 
 def resume_times(report: CameraReport, lost_at: float, nodes: int) -> list[float]:

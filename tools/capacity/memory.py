@@ -30,15 +30,16 @@ _ANSWER_HEADERS: Final = 4
 class StreamNeeds:
     """What one stream needs.
 
-    `node_kilobytes` is memory of the service's own process, `redis_kilobytes` that of Redis, and `files` the files that
-    the service has open for it, of which `redis_connections` are connections to Redis. `idle_megabytes` is the memory of a node without streams, with `workers` workers.
-    `frame_bytes` and `answer_bytes` are those of a frame and of its answer on a WebSocket.
+    `node_kilobytes` is memory of the service's own process, `redis_kilobytes` that of Redis, and `files` are those that
+    the service has open for it. `redis_connections` are those of the node, and `idle_megabytes` is its memory without
+    streams, with `workers` workers. `frame_bytes` and `answer_bytes` are those of a frame and of its answer on a
+    WebSocket.
     """
 
     node_kilobytes: float
     redis_kilobytes: float
     files: float
-    redis_connections: float
+    redis_connections: int
     idle_megabytes: float
     workers: int
     frame_bytes: float
@@ -67,7 +68,7 @@ def measure_stream_needs(frames: Path, folder: Path, workers: int = 2) -> Stream
         1e-3 * grown / _STREAMS,
         1e-3 * kept / _STREAMS,
         opened / _STREAMS,
-        connections / _STREAMS,
+        connections,
         1e-6 * idle,
         workers,
         mean(len(image) for image in images) + len('{"type":"frame","seq":1000,"timestamp":1000.123}') + _FRAME_HEADERS,

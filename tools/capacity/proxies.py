@@ -67,7 +67,7 @@ class ProxyLimits:
 
 def installed_proxies() -> list[str]:
     """Returns the names of the proxies that are installed."""
-    return [name for name in _CONFIGURATIONS if shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin")]
+    return [name for name in PROXIES if shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin")]
 
 
 def measure_proxy(name: str, *, tls: bool, sizes: tuple[int, int], seconds: float, folder: Path) -> ProxyLimits:
@@ -225,7 +225,7 @@ def _proxy(name: str, backend: int, tls: bool, folder: Path) -> Iterator[tuple[i
     """Runs a proxy with one worker before the backend. Yields its port and processes, and its control group."""
     port = free_port()
     path = folder / f"{name}.conf"
-    path.write_text(_CONFIGURATIONS[name](port, backend, tls, folder.resolve()), encoding="utf-8")
+    path.write_text(PROXIES[name](port, backend, tls, folder.resolve()), encoding="utf-8")
     executable = shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin") or name
     option = "-c" if name == "nginx" else "-f"
     group = CpuGroup(name)
@@ -324,7 +324,8 @@ backend nodes
 """
 
 
-_CONFIGURATIONS: Final[dict[str, Callable[[int, int, bool, Path], str]]] = {"nginx": _nginx, "haproxy": _haproxy}
+# The proxies that can be measured, and their configurations.
+PROXIES: Final[dict[str, Callable[[int, int, bool, Path], str]]] = {"nginx": _nginx, "haproxy": _haproxy}
 
 
 if __name__ == "__main__":

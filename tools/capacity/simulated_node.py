@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
+from functools import partial
 from random import Random
 from typing import Any, Final
 
@@ -108,6 +109,11 @@ class SimulatedNode:
         yield from self.loop_work(self._calibration.open_s)
         yield self.env.timeout(_REDIS_S)
 
+    def save(self) -> Process:
+        """Saves a session."""
+        self.saves += 1
+        yield from self.loop_work(self._calibration.save_s)
+
     def process(self, service: ServiceTime, expected_s: float, deadline: float | None) -> simpy.Event:
         """Gives a frame to the worker with the least work. Returns the event of its end; its value is the outcome."""
         worker = min(self._workers, key=lambda each: each.backlog_s(self.env.now))
@@ -184,7 +190,7 @@ class SimulatedStream:
         node, env = self._node, self._env
         self._protocol.request_slot()
         admitted = env.event()
-        waiter = node.admission.enter(self._caller, admitted.succeed, latest=self._mode == "latest")
+        waiter = node.admission.enter(self._caller, partial(_succeed, admitted), latest=self._mode == "latest")
         yield admitted
         frame = self._protocol.take_frame()
         assert frame is not None  # noqa: S101 - a waiting frame is replaced, never removed
@@ -214,4 +220,9 @@ class SimulatedStream:
         yield self._env.timeout(delay_s)
         self._save_is_due = False
         self._saved_at = self._env.now
-        self._node.saves += not self._is_gone
+        if not self._is_gone:
+            yield from self._node.save()
+
+
+def _succeed(event: simpy.Event) -> None:
+    event.succeed()

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from random import Random
-from statistics import median
 from typing import Final, Literal
 
 import numpy as np
@@ -67,12 +66,12 @@ class SimulationResult:
 def simulate(scenario: Scenario, calibration: Calibration, seed: int) -> SimulationResult:
     """Returns the result of a scenario. The same seed has the same result.
 
-    Without a network of its own, the scenario has the one of the calibration. Raises ValueError if no frame is answered.
+    Without a network of its own, the scenario has the one of the calibration. Raises ValueError if it answers no frame.
     """
     chance = Random(seed)  # noqa: S311
     env = simpy.Environment()
     nodes = [SimulatedNode(env, scenario.shape, calibration, Random(chance.random())) for _ in range(scenario.nodes)]  # noqa: S311
-    network = scenario.network or Network(median(each.rest_s for each in calibration.frames) / 2.0)
+    network = scenario.network or Network(calibration.network_s)
     frames: list[FrameLife] = []
     cameras = [
         SimulatedCamera(
