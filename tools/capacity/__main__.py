@@ -73,7 +73,7 @@ def measure(repeats: int, seconds: float, minutes: float | None, only: str, list
         return
     until = None if minutes is None else time.monotonic() + 60.0 * minutes
     if not Measurement(out, seconds, click.echo).run(repeats, selected, until):
-        click.echo("more cases are left; run this again to go on")
+        click.echo("runs are missing still; call this again to go on")
 
 
 @main.command()

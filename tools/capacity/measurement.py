@@ -17,6 +17,7 @@ from bench.workload import LARGE
 
 from capacity.calibration import Calibration, calibrate
 from capacity.cameras import CameraProcess, CameraReport, CameraRequest
+from capacity.disturbance import DisturbedError, undisturbed
 from capacity.load import Load, outcome
 from capacity.nodes import Node, NodeSetup, running_nodes, running_redis
 
@@ -68,9 +69,10 @@ class Measurement:
         self._images: list[bytes] = []
 
     def run(self, repeats: int, selected: Sequence[Case], until: float | None) -> bool:
-        """Measures what is missing of the `selected` cases. Returns False if the time `until` (monotonic) came first.
+        """Measures what is missing of the `selected` cases. Returns False if some is missing still.
 
-        Raises CpuGroupError, RuntimeError and OSError if that is not possible here.
+        It stops at the time `until` (monotonic), and does not keep runs that other programs disturbed. Raises
+        CpuGroupError, RuntimeError and OSError if that is not possible here.
         """
         (self._out / "runs").mkdir(parents=True, exist_ok=True)
         self._images = [path.read_bytes() for path in sorted(load_frames(self._frames).glob("*.jpg"))]
@@ -84,10 +86,12 @@ class Measurement:
             for case in selected
             if not self._run_path(case, repeat).exists()
         ]
+        complete = True
         for (engine, nodes, _), group in groupby(missing, lambda run: (run[0].engine, run[0].nodes, run[0].loss)):
-            if not self._run_group(engine, nodes, list(group), until):
+            complete &= self._run_group(engine, nodes, list(group), until)
+            if until is not None and time.monotonic() > until:
                 return False
-        return True
+        return complete
 
     def calibration_path(self, engine: Engine) -> Path:
         """The file with the service times of an engine."""
@@ -106,7 +110,7 @@ class Measurement:
 
     def _calibrate(self, engine: Engine) -> None:
         def measure(setup: NodeSetup, count: int) -> Calibration:
-            with running_redis(self._out) as url, running_nodes(1, setup, url, self._out) as nodes:
+            with running_redis(self._out) as url, running_nodes(1, setup, url, self._out) as nodes, undisturbed():
                 return calibrate(nodes[0], self._images, count, waits=engine == "waiting")
 
         self._say(f"calibrating one node, {engine}")
@@ -119,6 +123,7 @@ class Measurement:
     def _run_group(self, engine: Engine, nodes: int, runs: list[tuple[Case, int]], until: float | None) -> bool:
         """Measures cases on the same nodes. A lost node is not replaced, so after a loss they start again."""
         with ExitStack() as stack:
+            complete = True
             running: tuple[str, list[Node]] | None = None
             for case, repeat in runs:
                 if until is not None and time.monotonic() + 2.0 * self._seconds > until:
@@ -127,10 +132,16 @@ class Measurement:
                     stack.close()
                     url = stack.enter_context(running_redis(self._out))
                     running = url, stack.enter_context(running_nodes(nodes, self._setup(engine), url, self._out))
-                result = self._measure(case, repeat, *running)
+                try:
+                    with undisturbed():
+                        result = self._measure(case, repeat, *running)
+                except DisturbedError as error:
+                    self._say(f"{case.name:28} {repeat}  not kept: {error}")
+                    complete = False
+                    continue
                 self._run_path(case, repeat).write_text(json.dumps(result) + "\n", encoding="utf-8")
                 self._say(f"{case.name:28} {repeat}  {_summary(result)}")
-        return True
+        return complete
 
     def _measure(self, case: Case, repeat: int, redis_url: str, nodes: list[Node]) -> dict[str, Any]:
         seconds = LOSS_AFTER_S + _AFTER_LOSS_S if case.loss else _WARM_UP_S + self._seconds
