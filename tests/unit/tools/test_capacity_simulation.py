@@ -81,7 +81,7 @@ class Arrivals:
 def test_a_worker_with_constant_service_is_an_m_d_1_queue(load: float) -> None:
     arrivals = Arrivals(CONSTANT, 1, load, "all", 8000 * SERVICE_S / load)
     load = arrivals.load(1)
-    assert arrivals.mean_wait_s == pytest.approx(SERVICE_S * load / (2.0 * (1.0 - load)), rel=0.07)
+    assert arrivals.mean_wait_s == pytest.approx(SERVICE_S * load / (2.0 * (1.0 - load)), rel=0.1)
 
 
 @pytest.mark.parametrize(("workers", "load"), [(1, 0.6), (3, 0.75)])
@@ -173,7 +173,7 @@ def test_a_storm_lasts_as_long_as_the_other_node_needs_to_open_streams() -> None
     assert max(result.resumed_s) > 20 * 0.05
 
 
-def test_streams_give_up_if_a_loss_leaves_too_little(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_give_up_if_no_node_takes_them_in_time() -> None:
     times = replace(CONSTANT, open_s=12.0)
     result = simulate(Scenario(2, Load(8, 2.0), NodeShape(2), 60.0, lose_at=2.0), times, 1)
     assert result.gave_up > 0
