@@ -37,7 +37,7 @@ _RETRIES: Final = 3
 _BACKOFF_S: Final = (0.01, 0.1)
 # A connection that was unused for this long is tested before its next use.
 _HEALTH_CHECK_S: Final = 10
-# Connections of one replica. Redis accepts 10,000 in all, and all sessions of a replica may be saved at the same moment.
+# Connections of one replica. Redis accepts 10,000 in all, and a replica may save all its sessions at the same moment.
 _CONNECTIONS: Final = 16
 # After a failure, operations fail at once for this long instead of waiting for their own time limits.
 _PAUSE_S: Final = 1.0
