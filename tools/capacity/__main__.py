@@ -114,10 +114,10 @@ def limits(names: tuple[str, ...], seconds: float, out: Path) -> None:
     found: dict[str, Any] = {}
     for name, figures in measure_limits(names, frames, out, seconds):
         found[name] = figures
+        (out / "limits.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
         click.echo(name)
         for key, value in figures.items():
             click.echo(f"  {key:24}{value if isinstance(value, str | bool) else f'{value:,.6g}'}")
-    (out / "limits.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 def _rate(context: click.Context, parameter: click.Parameter, value: str) -> float | None:

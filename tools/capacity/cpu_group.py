@@ -9,6 +9,8 @@ from typing import Final
 
 # The limit holds in each period. In short ones, a node stops and goes so often that it is like a slower processor.
 PERIOD_S: Final = 0.01
+# Against other programs it has the highest weight: what it may use it gets.
+_SHARES, _WEIGHT = 262_144, 10_000
 _ROOT: Final = Path("/sys/fs/cgroup")
 
 
@@ -39,8 +41,10 @@ class CpuGroup:
         if self._is_v1:
             (self._folder / "cpu.cfs_period_us").write_text(str(period))
             (self._folder / "cpu.cfs_quota_us").write_text(str(quota))
+            (self._folder / "cpu.shares").write_text(str(_SHARES))
         else:
             (self._folder / "cpu.max").write_text(f"{quota} {period}")
+            (self._folder / "cpu.weight").write_text(str(_WEIGHT))
 
     def remove(self) -> None:
         """Removes the group, whose processes have ended."""

@@ -17,9 +17,9 @@ from bench.workload import LARGE
 
 from capacity.calibration import Calibration, calibrate
 from capacity.cameras import CameraProcess, CameraReport, CameraRequest
-from capacity.disturbance import DisturbedError, undisturbed
 from capacity.load import Load, outcome
 from capacity.nodes import Node, NodeSetup, running_nodes, running_redis
+from capacity.other_programs import others, take_precedence
 
 Engine = Literal["real", "waiting"]
 
@@ -69,11 +69,11 @@ class Measurement:
         self._images: list[bytes] = []
 
     def run(self, repeats: int, selected: Sequence[Case], until: float | None) -> bool:
-        """Measures what is missing of the `selected` cases. Returns False if some is missing still.
+        """Measures what is missing of the `selected` cases. Returns False if the time `until` (monotonic) came first.
 
-        It stops at the time `until` (monotonic), and does not keep runs that other programs disturbed. Raises
-        CpuGroupError, RuntimeError and OSError if that is not possible here.
+        Raises CpuGroupError, RuntimeError and OSError if that is not possible here.
         """
+        take_precedence()
         (self._out / "runs").mkdir(parents=True, exist_ok=True)
         self._images = [path.read_bytes() for path in sorted(load_frames(self._frames).glob("*.jpg"))]
         for engine in sorted({case.engine for case in selected}):
@@ -86,12 +86,10 @@ class Measurement:
             for case in selected
             if not self._run_path(case, repeat).exists()
         ]
-        complete = True
         for (engine, nodes, _), group in groupby(missing, lambda run: (run[0].engine, run[0].nodes, run[0].loss)):
-            complete &= self._run_group(engine, nodes, list(group), until)
-            if until is not None and time.monotonic() > until:
+            if not self._run_group(engine, nodes, list(group), until):
                 return False
-        return complete
+        return True
 
     def calibration_path(self, engine: Engine) -> Path:
         """The file with the service times of an engine."""
@@ -110,7 +108,7 @@ class Measurement:
 
     def _calibrate(self, engine: Engine) -> None:
         def measure(setup: NodeSetup, count: int) -> Calibration:
-            with running_redis(self._out) as url, running_nodes(1, setup, url, self._out) as nodes, undisturbed():
+            with running_redis(self._out) as url, running_nodes(1, setup, url, self._out) as nodes:
                 return calibrate(nodes[0], self._images, count, waits=engine == "waiting")
 
         self._say(f"calibrating one node, {engine}")
@@ -123,7 +121,6 @@ class Measurement:
     def _run_group(self, engine: Engine, nodes: int, runs: list[tuple[Case, int]], until: float | None) -> bool:
         """Measures cases on the same nodes. A lost node is not replaced, so after a loss they start again."""
         with ExitStack() as stack:
-            complete = True
             running: tuple[str, list[Node]] | None = None
             for case, repeat in runs:
                 if until is not None and time.monotonic() + 2.0 * self._seconds > until:
@@ -132,16 +129,12 @@ class Measurement:
                     stack.close()
                     url = stack.enter_context(running_redis(self._out))
                     running = url, stack.enter_context(running_nodes(nodes, self._setup(engine), url, self._out))
-                try:
-                    with undisturbed():
-                        result = self._measure(case, repeat, *running)
-                except DisturbedError as error:
-                    self._say(f"{case.name:28} {repeat}  not kept: {error}")
-                    complete = False
-                    continue
+                with others() as found:
+                    result = self._measure(case, repeat, *running)
+                result["others_share"] = found.share
                 self._run_path(case, repeat).write_text(json.dumps(result) + "\n", encoding="utf-8")
                 self._say(f"{case.name:28} {repeat}  {_summary(result)}")
-        return complete
+        return True
 
     def _measure(self, case: Case, repeat: int, redis_url: str, nodes: list[Node]) -> dict[str, Any]:
         seconds = LOSS_AFTER_S + _AFTER_LOSS_S if case.loss else _WARM_UP_S + self._seconds
@@ -233,7 +226,8 @@ def _summary(result: dict[str, Any]) -> str:
     return (
         f"{result['answered_per_s']:6.1f} frames/s, {result['dropped_share']:.0%} dropped,"
         f" p50 {result['p50_ms']:.0f} ms, p95 {result['p95_ms']:.0f} ms,"
-        f" processor {result['loop_ms_per_frame']:.1f} + {result['worker_ms_per_frame']:.1f} ms per frame"
+        f" processor {result['loop_ms_per_frame']:.1f} + {result['worker_ms_per_frame']:.1f} ms per frame,"
+        f" {result['others_share']:.0%} used by other programs"
     )
 
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import json
+import time
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
-from capacity import disturbance, measurement
+from capacity import measurement
 from capacity.__main__ import main
 from capacity.calibration import Calibration, ServiceTime
 from capacity.cameras import CameraReport
 from capacity.comparison import Comparison, compare, summary, table
 from capacity.cpu_group import CpuGroup, CpuGroupError
-from capacity.disturbance import DisturbedError, undisturbed
 from capacity.load import FrameLife, Load
 from capacity.measurement import Case, Measurement, cases, resume_times
+from capacity.other_programs import others
 from capacity.proxies import PROXIES
 from click.testing import CliRunner
 
@@ -176,7 +177,11 @@ def test_a_control_group_gets_its_limit(version: int, tmp_path: Path) -> None:
     group.add(4711)
     group.limit(0.4)
     content = {path.name: path.read_text() for path in folder.iterdir()}
-    limit = {"cpu.cfs_period_us": "10000", "cpu.cfs_quota_us": "4000"} if version == 1 else {"cpu.max": "4000 10000"}
+    limit = (
+        {"cpu.cfs_period_us": "10000", "cpu.cfs_quota_us": "4000", "cpu.shares": "262144"}
+        if version == 1
+        else {"cpu.max": "4000 10000", "cpu.weight": "10000"}
+    )
     assert content == {"cgroup.procs": "4711", **limit}
 
 
@@ -185,32 +190,42 @@ def test_a_control_group_that_is_not_allowed_says_so(tmp_path: Path) -> None:
         CpuGroup("node", tmp_path / "missing")
 
 
-def test_a_disturbed_measurement_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    clocks = iter([disturbance._Clock(0.0, 0.0, 0.0), disturbance._Clock(10.0, 8.0, 20.0)])
-    monkeypatch.setattr(disturbance._Clock, "read", lambda: next(clocks))
-    with pytest.raises(DisturbedError, match="other programs used 10% of the"), undisturbed():
-        pass
-
-
-def test_a_disturbed_run_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_kept_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for engine in ("real", "waiting"):
         TIMES.write(tmp_path / f"calibration-{engine}.json")
-    disturbed = iter([True, False])
+    measured: list[tuple[str, int]] = []
 
-    def measure(*_: object) -> dict[str, Any]:
-        if next(disturbed):
-            raise DisturbedError("other programs used 50%")
-        return {"case": CASE.name, "resumed_s": [0.1]}
+    def measure(self: Measurement, case: Case, repeat: int, *_: object) -> dict[str, Any]:
+        measured.append((case.name, repeat))
+        return {"case": case.name, "resumed_s": [0.1]}
 
-    said: list[str] = []
     monkeypatch.setattr(Measurement, "_measure", measure)
+    monkeypatch.setattr(measurement, "take_precedence", lambda: None)
     monkeypatch.setattr(measurement, "load_frames", lambda folder: folder)
     monkeypatch.setattr(measurement, "running_redis", lambda _: nullcontext("redis://"))
     monkeypatch.setattr(measurement, "running_nodes", lambda *_: nullcontext([]))
-    monkeypatch.setattr(measurement, "undisturbed", nullcontext)
-    measuring = Measurement(tmp_path, 1.0, said.append)
-    assert not measuring.run(1, [CASE], None)
+    measuring = Measurement(tmp_path, 1.0, lambda _: None)
+    assert not measuring.run(2, [CASE], until=0.0)
+    assert measured == []
     assert measuring.run(1, [CASE], None)
-    assert measuring.run(1, [CASE], None), "there is nothing left to measure"
-    assert ["not kept" in line for line in said] == [True, False]
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == [f"{CASE.name}-0.json"]
+    assert measuring.run(2, [CASE], None)
+    assert measured == [(CASE.name, 0), (CASE.name, 1)]
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {f"{CASE.name}-{each}.json" for each in (0, 1)}
+
+
+def test_measuring_without_root_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr("os.setpriority", refuse)
+    code, output = run("measure", "--out", tmp_path)
+    assert code == 1
+    assert "measuring needs precedence over other programs: run as root" in output
+
+
+def test_what_this_program_uses_is_not_used_by_others() -> None:
+    with others() as found:
+        end = time.monotonic() + 0.3
+        while time.monotonic() < end:
+            pass
+    assert 0.0 <= found.share < 1.0
