@@ -142,7 +142,7 @@ def _rate(context: click.Context, parameter: click.Parameter, value: str) -> flo
 @click.option("--fps", default="15", callback=_rate, show_default=True, help="Frames per second of a camera, or max.")
 @click.option("--mode", type=click.Choice(get_args(Mode)), default="latest", show_default=True)
 @click.option("--in-flight", type=click.IntRange(1, 8), default=8, show_default=True, help="Unanswered frames.")
-@click.option("--balancer", type=click.Choice(BALANCERS), default="client", show_default=True)
+@click.option("--balancer", type=click.Choice(BALANCERS), default="rotated", show_default=True)
 @click.option("--network-ms", type=click.FloatRange(0.0), help="Delay in one direction  [default: as calibrated]")
 @click.option("--jitter-ms", type=click.FloatRange(0.0), default=0.0, show_default=True, help="Mean further delay.")
 @click.option("--lose-at", type=click.FloatRange(0.0), help="Second in which the first node is lost.")

@@ -69,7 +69,7 @@ class SimulatedCamera:
 
     def start(self, until: float) -> None:
         """Connects, and sends frames until the time `until`."""
-        self._attach(cast("Callable[[], SimulatedNode]", self._failover.endpoint)())
+        self._attach(self._connect())
         self._failover.connected()
         self._env.process(self._send_frames(until))
 
@@ -78,11 +78,21 @@ class SimulatedCamera:
         self._lost_at = self._env.now
         self._env.process(self._reconnect())
 
+    def _connect(self) -> SimulatedNode:
+        """Connects to the node that the policy, or the balancer, chooses."""
+        node = self.node = cast("Callable[[], SimulatedNode]", self._failover.endpoint)()
+        node.connections += 1
+        return node
+
+    def _disconnect(self) -> None:
+        assert self.node is not None  # noqa: S101 - it was connected
+        self.node.connections -= 1
+        self.node = None
+
     def _attach(self, node: SimulatedNode) -> None:
         def answer(seq: int, answered: bool) -> None:
             self._env.process(self._return(stream, seq, answered))
 
-        self.node = node
         stream = self._stream = SimulatedStream(node, self._load.mode, self._caller, answer)
         self._notify()
 
@@ -150,6 +160,7 @@ class SimulatedCamera:
         assert self._stream is not None  # noqa: S101 - it was connected
         self._stream.close()
         self._stream = None
+        self._disconnect()
         if self._load.mode == "latest":
             self._unanswered.clear()
         node: SimulatedNode | None = None
@@ -169,15 +180,15 @@ class SimulatedCamera:
 
     def _attempt(self) -> simpy.events.ProcessGenerator:
         """Tries to open the stream. Returns the node that took it, or None."""
-        node = cast("Callable[[], SimulatedNode]", self._failover.endpoint)()
+        node = self._connect()
         # TCP's handshake, and the request, or the refusal.
         yield self._env.timeout(2.0 * self._delay_s())
         if node.lost:
-            return None
+            return self._disconnect()
         yield self._env.timeout(self._delay_s())
         opening = self._env.process(node.open_stream())
         yield opening | self._env.timeout(max(self._failover.timeout_s, READY_TIMEOUT_S))
         if not opening.triggered or node.lost:
-            return None
+            return self._disconnect()
         yield self._env.timeout(self._delay_s())
         return node

@@ -69,7 +69,8 @@ class SimulatedNode:
     def __init__(self, env: simpy.Environment, shape: NodeShape, calibration: Calibration, chance: Random) -> None:
         self.env = env
         self.lost = False
-        self.streams = 0
+        # Its connections, also of streams that are being opened.
+        self.connections = 0
         self.saves = 0
         # From the arrival of each frame to its beginning in a worker.
         self.queue_delays: list[float] = []
@@ -154,13 +155,11 @@ class SimulatedStream:
         self._saved_at = -_SAVE_S
         self._save_is_due = False
         self.closed = False
-        node.streams += 1
         self._env.process(self._answer_frames())
 
     def close(self) -> None:
         """Ends the stream. Frames that it still has are not answered."""
         self.closed = True
-        self._node.streams -= 1
 
     def receive(self, seq: int) -> Process:
         """Receives a frame that has arrived at the node."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from random import Random
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 import simpy
@@ -16,10 +16,11 @@ from capacity.load import FrameLife, Load, Outcome, outcome
 from capacity.simulated_camera import Network, SimulatedCamera
 from capacity.simulated_node import NodeShape, SimulatedNode
 
-# How a camera gets its node: `client`, from a list of URLs, in which each camera has another one first; or from a
-# balancer behind one URL, which takes the node with the fewest streams, or any.
-Balancer = Literal["client", "least", "random"]
-BALANCERS: Final[tuple[Balancer, ...]] = ("client", "least", "random")
+# How a camera gets its node. With `rotated` and `shuffled`, from its own list of URLs: the cameras have different ones
+# first, and the others follow in the same order, or in a random one. With `least` and `random`, from a balancer behind
+# one URL, which takes the node with the fewest streams, or any.
+Balancer = Literal["rotated", "shuffled", "least", "random"]
+BALANCERS: Final[tuple[Balancer, ...]] = get_args(Balancer)
 
 # Left out at the beginning: the first frames come from the cameras in a row.
 WARM_UP_S: Final = 4.0
@@ -38,7 +39,7 @@ class Scenario:
     load: Load
     shape: NodeShape = NodeShape()
     seconds: float = 60.0
-    balancer: Balancer = "client"
+    balancer: Balancer = "rotated"
     network: Network | None = None
     lose_at: float | None = None
 
@@ -118,13 +119,16 @@ def simulate(scenario: Scenario, calibration: Calibration, seed: int) -> Simulat
 def _routes(
     balancer: Balancer, nodes: list[SimulatedNode], camera: int, chance: Random
 ) -> list[Callable[[], SimulatedNode]]:
-    if balancer == "client":
+    if balancer in ("rotated", "shuffled"):
         first = camera % len(nodes)
-        return [partial(lambda node: node, node) for node in nodes[first:] + nodes[:first]]
+        others = nodes[first + 1 :] + nodes[:first]
+        if balancer == "shuffled":
+            chance.shuffle(others)
+        return [partial(lambda node: node, node) for node in (nodes[first], *others)]
 
     def choose() -> SimulatedNode:
         alive = [node for node in nodes if not node.lost] or nodes
-        return chance.choice(alive) if balancer == "random" else min(alive, key=lambda node: node.streams)
+        return chance.choice(alive) if balancer == "random" else min(alive, key=lambda node: node.connections)
 
     return [choose]
 

@@ -179,10 +179,16 @@ def test_streams_give_up_if_no_node_takes_them_in_time() -> None:
     assert result.gave_up > 0
 
 
-@pytest.mark.parametrize("balancer", ["client", "least"])
+@pytest.mark.parametrize("balancer", ["rotated", "shuffled", "least"])
 def test_balancers_that_count_give_each_node_as_many_streams(balancer: str) -> None:
     scenario = Scenario(3, Load(12, 5.0), NodeShape(1, processors=1), 20.0, balancer)  # type: ignore[arg-type]
     assert simulate(scenario, CONSTANT, 1).outcome.p99_ms < 1e3 * SERVICE_S * 5
+
+
+def test_urls_in_the_same_order_give_all_streams_of_a_lost_node_to_the_next_one() -> None:
+    scenario = Scenario(5, Load(20, 8.0), NodeShape(1, processors=1), 10.0, "rotated", lose_at=2.0)
+    rotated, shuffled = (simulate(replace(scenario, balancer=each), CONSTANT, 1) for each in ("rotated", "shuffled"))
+    assert rotated.outcome.dropped_share > 2.0 * shuffled.outcome.dropped_share
 
 
 def test_a_random_balancer_overloads_some_nodes() -> None:
