@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ def test_a_node_is_calibrated_and_measured_and_compared(tmp_path: Path, monkeypa
     monkeypatch.setattr(measurement, "_CALIBRATED_FRAMES", 6)
     monkeypatch.setattr(measurement, "_WARM_UP_S", 0.5)
     # Other tests may run beside it.
-    monkeypatch.setattr(measurement, "take_precedence", lambda: None)
+    monkeypatch.setattr(measurement, "precedence", nullcontext)
     (tmp_path / "calibration-real.json").write_bytes(SHIPPED.read_bytes())
     (case,) = (case for case in cases() if case.name == "waiting-1-latest-2x10")
     said: list[str] = []

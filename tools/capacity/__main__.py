@@ -53,7 +53,7 @@ def main() -> None:
 
 @main.command()
 @click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Runs of each case.")
-@click.option("--seconds", type=click.FloatRange(1.0), default=15.0, show_default=True, help="Seconds of each run.")
+@click.option("--seconds", type=click.FloatRange(1.0), default=10.0, show_default=True, help="Seconds of each run.")
 @click.option("--minutes", type=click.FloatRange(0.1), help="Stop after so long. The next call goes on.")
 @click.option("--only", default="", metavar="TEXT", help="Only the cases that have this in their names.")
 @click.option("--list", "listing", is_flag=True, help="Print the names of all cases, and exit.")

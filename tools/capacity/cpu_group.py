@@ -9,8 +9,9 @@ from typing import Final
 
 # The limit holds in each period. In short ones, a node stops and goes so often that it is like a slower processor.
 PERIOD_S: Final = 0.01
-# Against other programs it has the highest weight: what it may use it gets.
-_SHARES, _WEIGHT = 262_144, 10_000
+# The highest weights against other programs.
+_SHARES: Final = 262_144
+_WEIGHT: Final = 10_000
 _ROOT: Final = Path("/sys/fs/cgroup")
 
 
@@ -35,16 +36,25 @@ class CpuGroup:
         """Moves a process, with its later children, into the group."""
         (self._folder / "cgroup.procs").write_text(str(pid))
 
+    def leave(self, pid: int) -> None:
+        """Moves a process back to the group above it."""
+        (self._folder.parent / "cgroup.procs").write_text(str(pid))
+
+    def take_precedence(self) -> None:
+        """Makes other programs wait if the processors do not suffice for all."""
+        if self._is_v1:
+            (self._folder / "cpu.shares").write_text(str(_SHARES))
+        else:
+            (self._folder / "cpu.weight").write_text(str(_WEIGHT))
+
     def limit(self, cores: float) -> None:
         """Limits the processor time of the group per second to `cores` seconds."""
         quota, period = round(1e6 * cores * PERIOD_S), round(1e6 * PERIOD_S)
         if self._is_v1:
             (self._folder / "cpu.cfs_period_us").write_text(str(period))
             (self._folder / "cpu.cfs_quota_us").write_text(str(quota))
-            (self._folder / "cpu.shares").write_text(str(_SHARES))
         else:
             (self._folder / "cpu.max").write_text(f"{quota} {period}")
-            (self._folder / "cpu.weight").write_text(str(_WEIGHT))
 
     def remove(self) -> None:
         """Removes the group, whose processes have ended."""

@@ -19,7 +19,7 @@ from capacity.calibration import Calibration, calibrate
 from capacity.cameras import CameraProcess, CameraReport, CameraRequest
 from capacity.load import Load, outcome
 from capacity.nodes import Node, NodeSetup, running_nodes, running_redis
-from capacity.other_programs import others, take_precedence
+from capacity.other_programs import others, precedence
 
 Engine = Literal["real", "waiting"]
 
@@ -27,7 +27,7 @@ Engine = Literal["real", "waiting"]
 CORES: Final = 0.4
 _CALIBRATED_FRAMES: Final = 100
 _IMAGES: Final = 24
-_WARM_UP_S: Final = 4.0
+_WARM_UP_S: Final = 3.0
 # From the first frame to the loss of a node, and from there to the end.
 LOSS_AFTER_S: Final = 5.0
 _AFTER_LOSS_S: Final = 8.0
@@ -51,10 +51,9 @@ class Case:
 
 def cases() -> list[Case]:
     """Returns all cases: from half of what a node can do to more than it can, and the loss of a node."""
-    closed = Load(4, None, "all", in_flight=2)
     loads: dict[Engine, tuple[Load, ...]] = {
-        "real": (Load(2, 4.0), Load(3, 4.0), Load(6, 4.0), closed),
-        "waiting": (Load(2, 10.0), Load(3, 10.0), Load(5, 10.0), closed),
+        "real": (Load(2, 4.0), Load(3, 4.0), Load(6, 4.0), Load(4, None, "all", in_flight=2)),
+        "waiting": (Load(2, 10.0), Load(3, 10.0), Load(5, 10.0)),
     }
     found = [Case(engine, nodes, load) for nodes in (1, 2, 3) for engine, each in loads.items() for load in each]
     return [*found, *(Case("waiting", nodes, Load(2, 5.0), loss=True) for nodes in (2, 3))]
@@ -73,7 +72,10 @@ class Measurement:
 
         Raises CpuGroupError, RuntimeError and OSError if that is not possible here.
         """
-        take_precedence()
+        with precedence():
+            return self._run(repeats, selected, until)
+
+    def _run(self, repeats: int, selected: Sequence[Case], until: float | None) -> bool:
         (self._out / "runs").mkdir(parents=True, exist_ok=True)
         self._images = [path.read_bytes() for path in sorted(load_frames(self._frames).glob("*.jpg"))]
         for engine in sorted({case.engine for case in selected}):

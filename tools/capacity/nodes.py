@@ -92,7 +92,9 @@ def _start(
     command: list[str | Path] = [LANESTREAM, "serve", "--provider", "cpu", "--port", str(port)]
     if setup.waiting_times is not None:
         command = [sys.executable, "-m", "capacity.waiting_node", setup.waiting_times, str(port)]
-    variables = {"LANESTREAM_PROCESSES": str(setup.workers), "LANESTREAM_MAX_SESSIONS": "10000"}
+    # A single worker would have several threads, which the simulation does not model.
+    variables = {"LANESTREAM_PROCESSES": str(setup.workers), "LANESTREAM_THREADS": "1"}
+    variables["LANESTREAM_MAX_SESSIONS"] = "10000"
     if redis_url is not None:
         variables["LANESTREAM_REDIS_URL"] = redis_url
     environment = {**os.environ, **variables, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -102,6 +104,7 @@ def _start(
     if setup.cores is None:
         return process, f"http://127.0.0.1:{port}", None
     group = CpuGroup(str(number))
+    group.take_precedence()
     # Before its workers exist: they start in the group of the process that starts them.
     group.add(process.pid)
     stack.callback(group.remove)

@@ -9,15 +9,20 @@ from dataclasses import dataclass
 
 import psutil
 
-_FIRST = -20
+from capacity.cpu_group import CpuGroup
 
 
-def take_precedence() -> None:
-    """Gives this process, and those that it starts, precedence over others. Raises PermissionError without root."""
+@contextmanager
+def precedence() -> Iterator[None]:
+    """Gives this process, and those that it starts in the block, precedence over others. Raises CpuGroupError."""
+    group = CpuGroup("measurement")
+    group.take_precedence()
+    group.add(os.getpid())
     try:
-        os.setpriority(os.PRIO_PROCESS, 0, _FIRST)
-    except OSError:
-        raise PermissionError("measuring needs precedence over other programs: run as root") from None
+        yield
+    finally:
+        group.leave(os.getpid())
+        group.remove()
 
 
 @dataclass
@@ -36,7 +41,7 @@ def others() -> Iterator[Others]:
     after, own = psutil.cpu_times(), _own_s() - own
     idle_s = after.idle + after.iowait - before.idle - before.iowait
     all_s = sum(after) - after.guest - after.guest_nice - (sum(before) - before.guest - before.guest_nice)
-    found.share = max(0.0, all_s - idle_s - own) / all_s
+    found.share = max(0.0, all_s - idle_s - own) / all_s if all_s else 0.0
 
 
 def _own_s() -> float:

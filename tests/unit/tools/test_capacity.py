@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import time
 from contextlib import nullcontext
@@ -176,6 +177,7 @@ def test_a_control_group_gets_its_limit(version: int, tmp_path: Path) -> None:
     (folder,) = (tmp_path / "cpu" if version == 1 else tmp_path).glob("lanestream-*-node")
     group.add(4711)
     group.limit(0.4)
+    group.take_precedence()
     content = {path.name: path.read_text() for path in folder.iterdir()}
     limit = (
         {"cpu.cfs_period_us": "10000", "cpu.cfs_quota_us": "4000", "cpu.shares": "262144"}
@@ -200,7 +202,7 @@ def test_runs_are_kept_and_not_repeated(tmp_path: Path, monkeypatch: pytest.Monk
         return {"case": case.name, "resumed_s": [0.1]}
 
     monkeypatch.setattr(Measurement, "_measure", measure)
-    monkeypatch.setattr(measurement, "take_precedence", lambda: None)
+    monkeypatch.setattr(measurement, "precedence", nullcontext)
     monkeypatch.setattr(measurement, "load_frames", lambda folder: folder)
     monkeypatch.setattr(measurement, "running_redis", lambda _: nullcontext("redis://"))
     monkeypatch.setattr(measurement, "running_nodes", lambda *_: nullcontext([]))
@@ -215,12 +217,13 @@ def test_runs_are_kept_and_not_repeated(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_measuring_without_root_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
-        raise PermissionError
+        raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("os.setpriority", refuse)
+    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(Path, "mkdir", refuse)
     code, output = run("measure", "--out", tmp_path)
     assert code == 1
-    assert "measuring needs precedence over other programs: run as root" in output
+    assert "-measurement: Permission denied; run as root" in output
 
 
 def test_what_this_program_uses_is_not_used_by_others() -> None:
