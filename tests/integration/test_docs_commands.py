@@ -50,7 +50,6 @@ NOT_RUN = [
     ("docs/capacity.md", "make capacity*", f"{LONG}; tests/integration/test_capacity.py runs a part"),
     ("docs/capacity.md", "make bench", f"{LONG}; tests/integration/test_bench.py runs a part"),
     ("docs/capacity.md", "* -m capacity *", "tests/unit/tools/test_capacity.py and tests/integration/test_capacity.py"),
-    ("docs/capacity.md", "* tools/gpu_check.py*", "needs a GPU"),
     ("docs/client.md", "from lanestream_client import *open_source*", "tests/integration/test_network_cameras.py"),
     ("docs/client.md", "from pathlib import Path*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import asyncio*", "tests/integration/test_clients.py"),

@@ -1,13 +1,14 @@
 """Real cameras, in a process of their own: streams of the Python client that send encoded frames.
 
-python -m capacity.cameras reads one request as JSON from its standard input, and writes the lives of the frames, and
-the stages of the answered ones, as JSON to its standard output.
+python -m capacity.cameras reads one request as JSON from its standard input, and writes the lives of the frames as JSON
+to its standard output.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import os
 import random
 import subprocess
 import sys
@@ -21,7 +22,6 @@ from bench.frames import forward_and_backward
 
 from capacity.load import JITTER, FrameLife, Load
 from lanestream.errors import LanestreamError
-from lanestream.protocol import LanesMessage
 from lanestream_client import AsyncLaneClient, SourceFrame
 
 # From the start of the process to the first frame: every stream is open by then.
@@ -43,35 +43,22 @@ class CameraRequest:
     frames: Path
 
 
-@dataclass(frozen=True)
-class Stages:
-    """When a frame waited and worked in the service, in seconds: `queue`, all other stages, and both together."""
-
-    queue: float
-    work: float
-    total: float
-
-
 @dataclass
 class CameraReport:
-    """When the first frames were due (monotonic seconds), the lives of all frames, and the stages of answered ones.
-
-    `stages` has None for frames without an answer. `reconnects` counts those of all cameras.
-    """
+    """When the first frames were due (monotonic seconds), and the lives of all frames."""
 
     began: float = 0.0
     frames: list[FrameLife] = field(default_factory=list)
-    stages: list[Stages | None] = field(default_factory=list)
-    reconnects: int = 0
 
 
 class CameraProcess:
-    """The process, as the one sees it that started it."""
+    """The process, as its parent sees it."""
 
     def __init__(self, request: CameraRequest) -> None:
         content = {**asdict(request), "frames": str(request.frames.resolve())}
         self._process = subprocess.Popen(
             [sys.executable, "-m", "capacity.cameras"],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -86,12 +73,7 @@ class CameraProcess:
         if self._process.returncode:
             raise RuntimeError("the process with the cameras failed, see above")
         content = json.loads(output)
-        return CameraReport(
-            content["began"],
-            [FrameLife(*frame) for frame in content["frames"]],
-            [None if stages is None else Stages(*stages) for stages in content["stages"]],
-            content["reconnects"],
-        )
+        return CameraReport(content["began"], [FrameLife(*frame) for frame in content["frames"]])
 
     def kill(self) -> None:
         """Ends the process."""
@@ -117,22 +99,12 @@ class Cameras:
     async def _stream(self, camera: int) -> None:
         lives: dict[int, int] = {}
         load = self._request.load
-        client = AsyncLaneClient(self._request.urls[camera], in_flight=load.in_flight)
-        async with client:
-            stream = client.stream(self._source(camera, lives), mode=load.mode)
-            try:
-                async for result in stream:
-                    if result.lanes is not None:
-                        self._answered(lives[result.frame.seq], result.lanes)
-            finally:
-                self.report.reconnects += stream.reconnects
-
-    def _answered(self, index: int, lanes: LanesMessage) -> None:
-        life = self.report.frames[index]
-        self.report.frames[index] = FrameLife(life.camera, life.captured, time.monotonic())
-        timing = lanes.timing_ms
-        work = timing.decode + timing.propose + timing.infer + timing.fit + timing.track
-        self.report.stages[index] = Stages(1e-3 * timing.queue, 1e-3 * work, 1e-3 * timing.total)
+        async with AsyncLaneClient(self._request.urls[camera], in_flight=load.in_flight) as client:
+            async for result in client.stream(self._source(camera, lives), mode=load.mode):
+                if result.lanes is not None:
+                    index = lives[result.frame.seq]
+                    life = self.report.frames[index]
+                    self.report.frames[index] = FrameLife(camera, life.captured, time.monotonic())
 
     async def _source(self, camera: int, lives: dict[int, int]) -> AsyncIterator[SourceFrame]:
         load, chance = self._request.load, random.Random(f"{self._request.seed}-{camera}")  # noqa: S311
@@ -152,7 +124,6 @@ class Cameras:
                 return
             lives[seq] = len(self.report.frames)
             self.report.frames.append(FrameLife(camera, now, None))
-            self.report.stages.append(None)
             image = self._images[forward_and_backward(7 * camera + seq, len(self._images))]
             yield SourceFrame(seq, now, image)
 
@@ -165,15 +136,8 @@ def main() -> None:
         report = asyncio.run(Cameras(request).run())
     except LanestreamError as error:
         sys.exit(f"error: {error}")
-    json.dump(
-        {
-            "began": report.began,
-            "frames": [(life.camera, life.captured, life.answered) for life in report.frames],
-            "stages": [None if each is None else (each.queue, each.work, each.total) for each in report.stages],
-            "reconnects": report.reconnects,
-        },
-        sys.stdout,
-    )
+    frames = [(life.camera, life.captured, life.answered) for life in report.frames]
+    json.dump({"began": report.began, "frames": frames}, sys.stdout)
 
 
 if __name__ == "__main__":

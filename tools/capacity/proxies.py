@@ -184,7 +184,8 @@ def _backend(sizes: tuple[int, int]) -> Iterator[int]:
     """Runs a server that accepts every stream and answers each frame by bytes, in a process of its own."""
     port = free_port()
     arguments = [str(each) for each in (port, *sizes)]
-    process = subprocess.Popen([sys.executable, "-m", "capacity.proxies", *arguments])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-m", "capacity.proxies", *arguments], env=environment)
     try:
         _wait_until_listening(port, process)
         yield port
