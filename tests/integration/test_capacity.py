@@ -42,4 +42,4 @@ def test_a_node_is_calibrated_and_measured_and_compared(tmp_path: Path, monkeypa
 
     result = CliRunner().invoke(main, ["check", "--out", str(tmp_path)])
     assert result.exit_code in (0, 1)
-    assert f"| {case.name} | frames/s |" in result.output
+    assert f"| {case.name} | " in result.output

@@ -73,13 +73,25 @@ def compare(
 
 
 def table(comparisons: Sequence[Comparison]) -> Iterator[str]:
-    """Yields the lines of a Markdown table, one line for each case."""
-    yield "| nodes, load of each | figure | measured: median (min to max) | simulated | deviation |"
-    yield "| --- | --- | --- | --- | --- |"
-    for each in comparisons:
-        spread = f"{median(each.measured):.1f} ({min(each.measured):.1f} to {max(each.measured):.1f})"
-        mark = "" if each.is_close else " **"
-        yield f"| {each.case} | {each.figure} | {spread} | {each.simulated:.1f} | {each.deviation:+.0%}{mark} |"
+    """Yields the lines of a Markdown table, one for each case.
+
+    A cell has the median of the runs with their minimum and maximum, the simulation, and its deviation from the median.
+    """
+    figures = tuple(dict.fromkeys(each.figure for each in comparisons))
+    yield "| " + " | ".join(("case", *figures)) + " |"
+    yield "| " + " | ".join(["---"] * (len(figures) + 1)) + " |"
+    for case in dict.fromkeys(each.case for each in comparisons):
+        cells = {each.figure: _cell(each) for each in comparisons if each.case == case}
+        yield "| " + " | ".join((case, *(cells.get(figure, "") for figure in figures))) + " |"
+
+
+def _cell(each: Comparison) -> str:
+    digits = 0 if median(each.measured) >= 100.0 else 1
+    low, middle, high = (
+        f"{value:.{digits}f}" for value in (min(each.measured), median(each.measured), max(each.measured))
+    )
+    mark = "" if each.is_close else " **"
+    return f"{middle} ({low} to {high}); {each.simulated:.{digits}f}, {each.deviation:+.0%}{mark}"
 
 
 def summary(comparisons: Sequence[Comparison]) -> Iterator[str]:
