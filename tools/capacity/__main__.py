@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -221,4 +222,6 @@ def _scenario(
 
 
 if __name__ == "__main__":
+    # What was started must end in both cases.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     main()

@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -130,6 +131,8 @@ class Cameras:
 
 def main() -> None:
     """Runs the request on standard input."""
+    # Its parent ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     content = json.loads(sys.stdin.readline())
     request = CameraRequest(**{**content, "load": Load(**content["load"]), "frames": Path(content["frames"])})
     try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import signal
 import socket
 import ssl
 import subprocess
@@ -330,4 +331,6 @@ PROXIES: Final[dict[str, Callable[[int, int, bool, Path], str]]] = {"nginx": _ng
 
 
 if __name__ == "__main__":
+    # Its parent ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     asyncio.run(_serve(*(int(each) for each in sys.argv[1:4])))
