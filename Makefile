@@ -130,6 +130,13 @@ bench: $(DEV_READY)
 gpu-check: $(GPU_READY)
 	$(GPU_VENV)/bin/python tools/gpu_check.py $(ARGS)
 
+# Measures one, two and three nodes on this machine, and checks the simulation with them. Takes about half an hour; goes
+# on where it was interrupted. Needs redis-server, and root for the limits of the processor time.
+.PHONY: capacity
+capacity: $(DEV_READY)
+	PYTHONPATH=tools $(BIN)/python -m capacity measure $(ARGS)
+	PYTHONPATH=tools $(BIN)/python -m capacity check
+
 # Measures how much of what the processors could do `lanestream batch` does. ARGS='VIDEO...' instead of rendered ones.
 batch-speed: $(DEV_READY)
 	$(BIN)/python tools/batch_speed.py $(ARGS)

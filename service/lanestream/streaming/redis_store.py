@@ -37,6 +37,8 @@ _RETRIES: Final = 3
 _BACKOFF_S: Final = (0.01, 0.1)
 # A connection that was unused for this long is tested before its next use.
 _HEALTH_CHECK_S: Final = 10
+# Connections of one replica. Redis accepts 10,000 in all, and a replica may save all its sessions at the same moment.
+_CONNECTIONS: Final = 16
 # After a failure, operations fail at once for this long instead of waiting for their own time limits.
 _PAUSE_S: Final = 1.0
 # A session that was saved to check Redis expires after this many milliseconds.
@@ -99,6 +101,7 @@ class RedisStore:
                 "use redis://host:6379/0, or rediss://name:password@host:6379/0 with special characters of the password"
                 " percent-encoded",
             ) from None
+        self._connections = asyncio.Semaphore(_CONNECTIONS)
         self._clock = clock
         self._replica = secrets.token_hex(8)
         self._copies = MemoryStore(clock)
@@ -177,7 +180,7 @@ class RedisStore:
     async def _operation(self, timeout_s: float = _TIMEOUT_S) -> AsyncIterator[None]:
         """Turns errors of Redis and of the network into StoreError, and waits for `timeout_s` seconds at most."""
         try:
-            async with asyncio.timeout(timeout_s):
+            async with asyncio.timeout(timeout_s), self._connections:
                 yield
         except (RedisError, OSError, TimeoutError) as error:
             # A Redis that refuses an operation answers, so the next one will not have to wait either.

@@ -37,10 +37,13 @@ class Slot:
 
 
 @dataclass(eq=False)
-class _Waiter:
+class Waiter:
+    """A frame that waits for a slot or holds one. `admit` is called once, when it gets the slot."""
+
+    caller: str
     latest: bool
+    admit: Callable[[], None]
     slot: Slot = field(default_factory=Slot)
-    admitted: asyncio.Future[None] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
 
 
 @dataclass(eq=False)
@@ -51,21 +54,18 @@ class _Account:
     active_at: float
     mean_cost_s: float = _FIRST_COST_S
     held: int = 0
-    queue: deque[_Waiter] = field(default_factory=deque)
+    queue: deque[Waiter] = field(default_factory=deque)
 
 
-class FairSemaphore:
-    """Admits frames to `slots`; at most `latest_slots` of them for frames of mode `latest`.
+class FairQueue:
+    """The rules of admission, without waiting: at most `latest_slots` of the `slots` are for frames of mode `latest`.
 
     A caller that has used more than another active one may hold `per_caller` slots: a frame is never interrupted, so
     costly ones must not occupy every processor. The frames of one caller are admitted in their order, except that one
-    of mode `latest` that may not take a free slot keeps its position. `clock` returns monotonic seconds. Belongs to one
-    event loop.
+    of mode `latest` that may not take a free slot keeps its position. `clock` returns monotonic seconds.
     """
 
-    def __init__(
-        self, slots: int, latest_slots: int, per_caller: int, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, slots: int, latest_slots: int, per_caller: int, clock: Callable[[], float]) -> None:
         self._slots, self._latest_slots, self._per_caller = slots, latest_slots, per_caller
         self._clock = clock
         self._accounts: dict[str, _Account] = {}
@@ -73,27 +73,23 @@ class FairSemaphore:
         # and what it used while no one else wanted it is not held against it.
         self._virtual_s = 0.0
 
-    @asynccontextmanager
-    async def slot(self, caller: str, *, latest: bool = False) -> AsyncIterator[Slot]:
-        """Waits for a slot and holds it for the block."""
+    def enter(self, caller: str, admit: Callable[[], None], *, latest: bool = False) -> Waiter:
+        """Adds a frame, which may get a slot at once, and calls `admit` when it does."""
         account = self._accounts.setdefault(caller, _Account(self._virtual_s, self._clock()))
         if not account.queue and not account.held:
             account.used_s = max(account.used_s, self._virtual_s)
         account.active_at = self._clock()
-        waiter = _Waiter(latest)
+        waiter = Waiter(caller, latest, admit)
         account.queue.append(waiter)
         self._admit()
-        try:
-            await waiter.admitted
-        except asyncio.CancelledError:
-            if waiter in account.queue:
-                account.queue.remove(waiter)
-            else:  # admitted at the moment it was canceled
-                self._release(account, waiter)
-            raise
-        try:
-            yield waiter.slot
-        finally:
+        return waiter
+
+    def leave(self, waiter: Waiter) -> None:
+        """Removes a frame, and gives its slot to the next one if it holds one."""
+        account = self._accounts[waiter.caller]
+        if waiter in account.queue:
+            account.queue.remove(waiter)
+        else:
             self._release(account, waiter)
 
     def _admit(self) -> None:
@@ -118,8 +114,7 @@ class FairSemaphore:
         waiter.slot.expected_s = account.mean_cost_s
         account.used_s += waiter.slot.expected_s
         account.held += 1
-        if not waiter.admitted.done():
-            waiter.admitted.set_result(None)
+        waiter.admit()
         return True
 
     def _has_used_more(self, account: _Account) -> bool:
@@ -130,7 +125,7 @@ class FairSemaphore:
             for other in self._accounts.values()
         )
 
-    def _release(self, account: _Account, waiter: _Waiter) -> None:
+    def _release(self, account: _Account, waiter: Waiter) -> None:
         slot = waiter.slot
         self._slots += 1
         self._latest_slots += waiter.latest
@@ -153,3 +148,23 @@ class FairSemaphore:
         ]
         for caller in idle:
             del self._accounts[caller]
+
+
+class FairSemaphore:
+    """A `FairQueue` for the tasks of one event loop."""
+
+    def __init__(
+        self, slots: int, latest_slots: int, per_caller: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._queue = FairQueue(slots, latest_slots, per_caller, clock)
+
+    @asynccontextmanager
+    async def slot(self, caller: str, *, latest: bool = False) -> AsyncIterator[Slot]:
+        """Waits for a slot and holds it for the block."""
+        admitted = asyncio.Event()
+        waiter = self._queue.enter(caller, admitted.set, latest=latest)
+        try:
+            await admitted.wait()
+            yield waiter.slot
+        finally:
+            self._queue.leave(waiter)

@@ -294,3 +294,14 @@ async def test_a_redis_that_refuses_is_asked_again(tmp_path: Path, key: str) -> 
                 with pytest.raises(StoreError, match="WRONGTYPE"):
                     await store.save(key, session("ann", "a", b"1"), 60.0)
             await store.check()
+
+
+async def test_a_replica_saves_any_number_of_sessions_over_few_connections(redis_url: str, key: str) -> None:
+    async with replicas(1, redis_url) as (store,), Redis.from_url(redis_url) as client:
+        before = (await client.info("clients"))["connected_clients"]
+        saved = await asyncio.gather(
+            *(store.save(f"{key}-{number}", session("ann", "one", b"state"), 60.0) for number in range(200))
+        )
+        opened = (await client.info("clients"))["connected_clients"] - before
+    assert all(saved)
+    assert 1 <= opened <= 16

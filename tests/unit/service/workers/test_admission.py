@@ -148,4 +148,4 @@ async def test_accounts_of_idle_callers_are_forgotten() -> None:
         await frames.arrive(name)
         await frames.leave(name, cost_s=0.001)
         frames.now += 10.0
-    assert len(frames.semaphore._accounts) < 5
+    assert len(frames.semaphore._queue._accounts) < 5

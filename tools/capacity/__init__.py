@@ -1,0 +1,1 @@
+"""`make capacity`: a simulation of nodes, cameras and failures, and the measurements that it is checked against."""
