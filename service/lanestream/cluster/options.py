@@ -89,7 +89,7 @@ def check_settings(settings: Settings, options: ClusterOptions) -> None:
 
 
 def replica_settings(settings: Settings, options: ClusterOptions) -> Settings:
-    """Returns the settings of the replicas: what is not set follows from the processors that a replica reserves.
+    """Returns the settings of the replicas. Missing ones follow from the processors that a replica reserves.
 
     Access tokens are signed with one secret on all replicas. /metrics is off: a request gets to any one replica.
     """

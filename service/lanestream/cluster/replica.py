@@ -1,9 +1,9 @@
 """A replica on Ray Serve: the service's application, and what its own server does for it elsewhere.
 
-Serve stops a replica once its requests have ended, and a stream is a request that does not end by itself. Serve tells
-nothing to the application before, so the replica watches the list of replicas that Serve's routers use: if it is no
-longer in that list, it drains its streams. If the list has grown, it hands over its share of streams to the new ones,
-because a stream stays with its replica otherwise.
+Serve waits until the requests of a replica have ended before it stops it, and gives the application no notice. A stream
+is a request that does not end by itself. So the replica watches the list of replicas that Serve's routers use: if it is
+no longer in that list, it drains its streams. If the list has grown, it hands over a share of its streams to the new
+replicas, because otherwise a stream stays where it was opened.
 """
 
 from __future__ import annotations
