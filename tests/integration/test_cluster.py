@@ -115,7 +115,6 @@ def test_no_frame_is_lost_when_replicas_come_and_go(cluster: RayCluster, redis_u
 def test_a_restart_of_serves_controller_interrupts_no_stream(cluster: RayCluster, redis_url: str) -> None:
     deploy(redis_url, min_replicas=NODES, max_replicas=NODES)
     cameras = open_cameras(cluster.urls, NODES)
-    replicas = cluster.sessions().keys()
     cluster.kill("ray::ServeController")
     # Serve has found its replicas again, or replaced them, when its status says so.
     wait_for_replicas(cluster, NODES, each_with_sessions=False)
@@ -124,7 +123,6 @@ def test_a_restart_of_serves_controller_interrupts_no_stream(cluster: RayCluster
         camera.finish()
         check(camera, lost=0)
         assert camera.answers[-1][1] == 0
-    assert cluster.sessions().keys() == replicas
 
 
 def check_that_ray_shows_no_secret(cluster: RayCluster) -> None:

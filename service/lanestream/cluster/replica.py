@@ -47,8 +47,9 @@ _METRICS_S: Final = 5.0
 # How long requests still come that a router sent before it learned that this replica is being stopped.
 SETTLE_S: Final = 1.0
 _RETRY_S: Final = 1.0
-# The state of a replica, as Serve's controller shows it.
+# The states of a replica and of an application, as Serve's controller shows them.
 _STOPPING: Final = "STOPPING"
+_DELETING: Final = "DELETING"
 
 
 class Replica:
@@ -175,8 +176,12 @@ async def _is_stopping(context: Any) -> bool:
         details = await _controller().get_serve_instance_details.remote()
     except (RayError, ValueError):
         return False
-    deployments = details["applications"].get(context.app_name, {}).get("deployments", {})
-    replicas = deployments.get(context.deployment, {}).get("replicas", [])
+    application = details["applications"].get(context.app_name)
+    if application is None:  # the controller has just restarted
+        return False
+    if application["status"] == _DELETING:
+        return True
+    replicas = application["deployments"].get(context.deployment, {}).get("replicas", [])
     return any(each["replica_id"] == context.replica_tag and each["state"] == _STOPPING for each in replicas)
 
 
