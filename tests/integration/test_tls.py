@@ -12,6 +12,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,9 +42,9 @@ class Files(NamedTuple):
     ca: Path
 
 
-def write_files(folder: Path, authority: trustme.CA, name: str = "127.0.0.1") -> Files:
+def write_files(folder: Path, authority: trustme.CA, name: str = "127.0.0.1", **dates: datetime) -> Files:
     files = Files(folder / "certificate.pem", folder / "key.pem", folder / "ca.pem")
-    issued = authority.issue_cert(name)
+    issued = authority.issue_cert(name, **dates)
     files.certificate.write_bytes(b"".join(blob.bytes() for blob in issued.cert_chain_pems))
     files.key.write_bytes(issued.private_key_pem.bytes())
     files.ca.write_bytes(authority.cert_pem.bytes())
@@ -338,6 +339,16 @@ def test_a_renewed_certificate_is_used_without_a_restart(authority: trustme.CA, 
         assert _serial(url, context) == now
         process.send_signal(signal.SIGTERM)
         assert process.wait(fakes.WAIT_S) == -signal.SIGTERM
+
+
+def test_the_metrics_have_the_date_of_expiry(authority: trustme.CA, serve: Serve, tmp_path: Path) -> None:
+    for year in (2022, 2035):
+        begins, expires = datetime(2020, 1, 1, tzinfo=UTC), datetime(year, 5, 6, 7, 8, 9, tzinfo=UTC)
+        files = write_files(tmp_path, authority, not_before=begins, not_after=expires)
+        url = serve(fakes.engine(), tls_certificate=files.certificate, tls_key=files.key)
+        lines = httpx.get(f"{url}/metrics", verify=False).text.splitlines()  # noqa: S501 - it has expired
+        (value,) = [line for line in lines if line.startswith("lane_certificate_expiry_timestamp_seconds ")]
+        assert float(value.split()[1]) == expires.timestamp()
 
 
 def _start_error(**settings: object) -> str:

@@ -217,6 +217,11 @@ class Metrics:
         """Reports the worker processes; `pids` returns their process ids."""
         self._registry.register(WorkerCollector(pids))
 
+    def certificate(self, expires_at: Callable[[], float]) -> None:
+        """Reports the certificate for https; `expires_at` returns when it expires, in seconds since 1970."""
+        expiry = self._gauge("lane_certificate_expiry_timestamp_seconds", "When the certificate for https expires.")
+        expiry.set_function(expires_at)
+
     def collect(self) -> Iterable[Metric]:
         """Returns all metrics with their current values."""
         return self._registry.collect()

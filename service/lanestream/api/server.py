@@ -120,14 +120,14 @@ class LanestreamServer(uvicorn.Server):
     """A uvicorn server that answers the frames it has accepted before it stops."""
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
-        self.certificate = (
-            None if settings.tls_certificate is None else Certificate(settings.tls_certificate, settings.tls_key)
-        )
-        super().__init__(server_config(app, settings, self.certificate))
         self._service: Service = app.state.service
         self.watches = watched_keys(self._service)
-        if self.certificate is not None:
-            self.watches.append(FileWatch(self.certificate.files, self.certificate.reload))
+        self.certificate: Certificate | None = None
+        if settings.tls_certificate is not None:
+            self.certificate = certificate = Certificate(settings.tls_certificate, settings.tls_key)
+            self.watches.append(FileWatch(certificate.files, certificate.reload))
+            self._service.metrics.certificate(lambda: certificate.expires_at)
+        super().__init__(server_config(app, settings, self.certificate))
         self._reload_requested = False
 
     @contextmanager

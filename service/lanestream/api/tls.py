@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import logging
+import math
 import ssl
 from contextlib import suppress
 from http import HTTPStatus
@@ -32,18 +33,21 @@ _PIECE_BYTES: Final = 1 << 12
 _MOST_BYTES_WITHOUT_DATA: Final = 1 << 15
 # The first byte of a TLS handshake (RFC 8446, section 5.1).
 _HANDSHAKE_RECORD: Final = 22
+# OpenSSL's X509_V_FLAG_NO_CHECK_TIME: an expired certificate is shown, too.
+_NO_CHECK_TIME: Final = 0x200000
 
 
 class Certificate:
     """The certificate of the service, with its chain and private key, and the TLS settings that go with it.
 
-    `certificate` and `key` are PEM files; without `key` the first one contains the key, too. Raises SettingsError if
-    they can't be used.
+    `certificate` and `key` are PEM files; without `key` the first one contains the key, too. `expires_at` is in seconds
+    since 1970, and NaN if it can't be found out. Raises SettingsError if the files can't be used.
     """
 
     def __init__(self, certificate: Path, key: Path | None) -> None:
         self._certificate, self._key = certificate, key
         self.context, self._digest = self._load()
+        self.expires_at = _expiry(self.context, certificate)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -59,6 +63,7 @@ class Certificate:
             return
         if digest != self._digest:
             self.context, self._digest = context, digest
+            self.expires_at = _expiry(context, self._certificate)
             _log.info("the certificate has changed", extra={"event": "certificate_changed"})
 
     def _load(self) -> tuple[ssl.SSLContext, bytes]:
@@ -310,6 +315,29 @@ class TlsProtocol(asyncio.Protocol):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+
+
+def _expiry(context: ssl.SSLContext, certificate: Path) -> float:
+    """Returns when the certificate of `context` expires, in seconds since 1970; NaN if it can't be found out.
+
+    Python shows a certificate only to a peer that has verified it, so this plays one that trusts the file.
+    """
+    trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    trusting.check_hostname = False
+    trusting.verify_flags = ssl.VerifyFlags(trusting.verify_flags | ssl.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME)
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    try:
+        trusting.load_verify_locations(certificate)
+        client = trusting.wrap_bio(to_client, to_server)
+        server = context.wrap_bio(to_server, to_client, server_side=True)
+        # The client begins, and has the certificate with the server's answer.
+        for side in (client, server, client):
+            with suppress(ssl.SSLWantReadError):
+                side.do_handshake()
+        found = client.getpeercert() or {}
+        return float(ssl.cert_time_to_seconds(str(found["notAfter"])))
+    except (ssl.SSLError, OSError, ValueError, KeyError):
+        return math.nan
 
 
 def _reason(error: Exception) -> str:
