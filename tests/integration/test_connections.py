@@ -105,6 +105,16 @@ def test_a_body_that_goes_on_after_the_answer_ends_in_time(serve: Serve) -> None
         assert time.monotonic() < began + fakes.WAIT_S
 
 
+def test_a_peer_that_still_sends_is_not_reset_by_the_answer(url: str) -> None:
+    with connect(url) as connection:
+        connection.sendall(b"POST /v1/detect HTTP/1.1\r\nHost: x\r\nContent-Length: 9000000\r\n\r\n")
+        answer = read_all(connection)
+        assert answer.startswith(b"HTTP/1.1 413 ")
+        for _ in range(5):
+            connection.sendall(bytes(100_000))
+            time.sleep(0.02)
+
+
 def test_line_ends_between_requests_do_not_keep_a_connection(url: str) -> None:
     with connect(url) as connection:
         connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")

@@ -56,6 +56,7 @@ NOT_RUN = [
     ("docs/client.md", "import cv2*", "tests/integration/test_clients.py"),
     ("docs/client.md", "import rerun*", "tests/integration/test_clients.py"),
     ("docs/cluster.md", "*", "needs Ray; tests/integration/test_cluster.py and tests/integration/test_cluster_up.py"),
+    ("docs/deployment.md", "lanestream serve * --tls-certificate *", "tests/integration/test_tls.py"),
     ("docs/deployment.md", "make up*", DOCKER),
     ("docs/deployment.md", "apt install *", DOCKER),
     ("docs/deployment.md", "pipx install *", DOCKER),

@@ -46,9 +46,10 @@ _MEANINGS: Final[dict[CutReason, str]] = {
 
 # A peer must take this much, or everything that waits for it, each time the limit of `send_s` passes.
 _PROGRESS_BYTES: Final = 1 << 16
-# How long, and how much, is still read from a peer after the last answer.
+# How long, and how much, is still read from a peer after the last answer: more than an image of the default `max_bytes`,
+# because a proxy that is reset while it sends may lose the answer.
 _LINGER_S: Final = 1.0
-_MOST_DISCARDED_BYTES: Final = 1 << 22
+_MOST_DISCARDED_BYTES: Final = 12 << 20
 # An attack must not fill the log: one line for each reason in this time.
 _LOG_EVERY_S: Final = 10.0
 # Requests of one address, on average and as a burst. Most take less than a millisecond of the event loop.
@@ -266,6 +267,8 @@ class Connection(asyncio.Transport):
         self._progress_timer: asyncio.TimerHandle | None = None
         self._paused = self._held = self._reading_stopped = False
         self._lingering = self._ended = False
+        # Whether the peer is still sending the body of a request, which may have been answered already.
+        self.in_body = False
         self._discarded = 0
 
     def identify(self, caller: str) -> None:
@@ -341,7 +344,9 @@ class Connection(asyncio.Transport):
 
     def close(self) -> None:
         """Closes the connection once the peer has taken everything that was sent."""
-        if not self._lingering:
+        if self.in_body:
+            self.linger()
+        elif not self._lingering:
             self._close()
 
     def _close(self) -> None:

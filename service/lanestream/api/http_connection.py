@@ -64,7 +64,6 @@ class HttpConnection(_HttpProtocol):
         self._over = False
         self._between_requests = True
         self._has_turn = self._waits_for_turn = False
-        self._in_body = False
         self._head_bytes = self._headers_received = self._unwanted_bytes = 0
         self._got_body = False
 
@@ -101,7 +100,7 @@ class HttpConnection(_HttpProtocol):
         super().on_message_begin()
         self.scope["state"][STATE_KEY] = self._connection
         self._head_bytes = self._headers_received = self._unwanted_bytes = 0
-        self._between_requests = self._in_body = False
+        self._between_requests = self._connection.in_body = False
         if not self._has_turn:
             self._table.count_request(self._connection.address)
         self._has_turn = False
@@ -118,14 +117,14 @@ class HttpConnection(_HttpProtocol):
         self._headers_received += 1
         if self._headers_received > _MOST_HEADERS or len(name) + len(value) > _MOST_HEADER_BYTES:
             self._refusal = HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
-        elif not self._in_body:
+        elif not self._connection.in_body:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         """Starts the request, and the time limit of its body."""
         if self._over or self._refusal is not None:
             return
-        self._in_body = True
+        self._connection.in_body = True
         if len(self.pipeline) >= _MOST_WAITING_REQUESTS:
             self._cut("pipeline")
             return
@@ -144,7 +143,7 @@ class HttpConnection(_HttpProtocol):
 
     def on_message_complete(self) -> None:
         """Ends the time limit of the request: what follows is the service's own work."""
-        self._between_requests, self._in_body = True, False
+        self._between_requests, self._connection.in_body = True, False
         if self._over or self._refusal is not None:
             return
         self._cancel_timer()
@@ -165,6 +164,7 @@ class HttpConnection(_HttpProtocol):
         if self._refusal is not None:
             return
         self._over = True
+        self._connection.in_body = False
         self._cancel_timer()
         self._unread.clear()
         self._connection.hold_reading(False)
@@ -195,7 +195,7 @@ class HttpConnection(_HttpProtocol):
 
     def _piece_size(self) -> int:
         """Returns how much to parse at a time: a part of a body, or of a head up to its end."""
-        if self._in_body:
+        if self._connection.in_body:
             return _BODY_PIECE
         end = self._unread.find(_HEAD_END, 0, _HEAD_PIECE)
         return _HEAD_PIECE if end < 0 else end + len(_HEAD_END)

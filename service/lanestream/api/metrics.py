@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -92,6 +93,10 @@ class Metrics:
         self._store_reachable = self._gauge(
             "lane_store_reachable", "1 if sessions can be saved: no operation of the session store failed lately."
         )
+        self._certificate_expiry = self._gauge(
+            "lane_certificate_expiry_timestamp_seconds", "When the certificate for https expires; NaN without one."
+        )
+        self._certificate_expiry.set(math.nan)
         self._log_drops = self._gauge("lane_log_records_dropped", "Log records that were dropped since the start.")
         self._queue = self._gauge("lane_queue_depth", "Inference requests still waiting when the last batch started.")
         self._provider = self._gauge(
@@ -219,8 +224,7 @@ class Metrics:
 
     def certificate(self, expires_at: Callable[[], float]) -> None:
         """Reports the certificate for https; `expires_at` returns when it expires, in seconds since 1970."""
-        expiry = self._gauge("lane_certificate_expiry_timestamp_seconds", "When the certificate for https expires.")
-        expiry.set_function(expires_at)
+        self._certificate_expiry.set_function(expires_at)
 
     def collect(self) -> Iterable[Metric]:
         """Returns all metrics with their current values."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import logging
 import math
 import time
 from base64 import b64decode, b64encode
@@ -430,6 +431,7 @@ async def test_sessions_work_without_a_reachable_store(caplog: pytest.LogCapture
 
 
 async def test_failures_of_the_store_are_reported(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
     store, failures, clock = UnreachableStore(), [], Clock()
     registry = SessionRegistry(SessionLimits(), store, clock=clock, on_store_failure=lambda: failures.append(None))
     assert registry.store_reachable
@@ -439,7 +441,7 @@ async def test_failures_of_the_store_are_reported(caplog: pytest.LogCaptureFixtu
     clock.now += 2.1
     await registry.close(first, resumable=True)
     assert (registry.store_reachable, len(failures)) == (True, 1)
-    assert [getattr(record, "event", None) for record in caplog.records] == ["store_lost"]
+    assert [getattr(record, "event", None) for record in caplog.records] == ["store_lost", "store_restored"]
 
 
 async def test_a_store_that_fails_now_and_then_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
