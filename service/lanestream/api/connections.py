@@ -46,8 +46,8 @@ _MEANINGS: Final[dict[CutReason, str]] = {
 
 # A peer must take this much, or everything that waits for it, each time the limit of `send_s` passes.
 _PROGRESS_BYTES: Final = 1 << 16
-# How long, and how much, is still read from a peer after the last answer: more than an image of the default `max_bytes`,
-# because a proxy that is reset while it sends may lose the answer.
+# How long, and how much, is still read from a peer after the last answer. A proxy that is reset while it sends may lose
+# the answer, so this is more than an image of the default `max_bytes`.
 _LINGER_S: Final = 1.0
 _MOST_DISCARDED_BYTES: Final = 12 << 20
 # An attack must not fill the log: one line for each reason in this time.
