@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
+import fakes
 import gpu_steps
 import gpusteps
 import numpy as np
@@ -95,7 +97,11 @@ def test_a_step_that_goes_wrong_is_one_line_and_leaves_no_process(
     outcome = run_step(Step("wrong", run, limit_s), Plan("cpu", tmp_path))
     assert outcome.status == "failed"
     assert outcome.report.failures == [f"{message} (output in {tmp_path / 'gpu_check_wrong.log'})"]
-    assert [command for command in commands_of_run(str(tmp_path)) if "resource_tracker" not in command] == []
+    # A process that was killed disappears a moment later.
+    deadline = time.monotonic() + fakes.WAIT_S
+    while any("resource_tracker" not in command for command in commands_of_run(str(tmp_path))):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def test_outputs_that_differ_too_much_fail(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
