@@ -46,10 +46,11 @@ _MEANINGS: Final[dict[CutReason, str]] = {
 
 # A peer must take this much, or everything that waits for it, each time the limit of `send_s` passes.
 _PROGRESS_BYTES: Final = 1 << 16
-# How long, and how much, is still read from a peer after the last answer. A proxy that is reset while it sends may lose
-# the answer, so this is more than an image of the default `max_bytes`.
+# How long, and how much, is still read from a peer after the last answer. A proxy that is reset while it sends a body
+# may lose the answer, so of a body it is more than an image of the default `max_bytes`.
 _LINGER_S: Final = 1.0
-_MOST_DISCARDED_BYTES: Final = 12 << 20
+_MOST_DISCARDED_BYTES: Final = 1 << 22
+_MOST_DISCARDED_BODY_BYTES: Final = 12 << 20
 # An attack must not fill the log: one line for each reason in this time.
 _LOG_EVERY_S: Final = 10.0
 # Requests of one address, on average and as a burst. Most take less than a millisecond of the event loop.
@@ -319,7 +320,7 @@ class Connection(asyncio.Transport):
         """Discards what a peer still sends while the connection lingers. Returns False if it does not."""
         if self._lingering:
             self._discarded += len(data)
-            if self._discarded > _MOST_DISCARDED_BYTES:
+            if self._discarded > (_MOST_DISCARDED_BODY_BYTES if self.in_body else _MOST_DISCARDED_BYTES):
                 self.abort()
         return self._lingering
 
