@@ -189,7 +189,7 @@ def test_handshakes_of_one_address_take_turns(secure: Serve, trusted: ssl.SSLCon
     with ExitStack() as stack:
         # Each of them asks for a handshake; more than begin at once.
         context = ssl.create_default_context()
-        for _ in range(300):
+        for _ in range(600):
             outgoing = ssl.MemoryBIO()
             with pytest.raises(ssl.SSLWantReadError):
                 context.wrap_bio(ssl.MemoryBIO(), outgoing, server_hostname="127.0.0.1").do_handshake()

@@ -57,7 +57,7 @@ _LOG_EVERY_S: Final = 10.0
 _REQUESTS_PER_S: Final = 500.0
 _REQUEST_BURST_S: Final = 1.0
 # TLS handshakes of one address, on average and as a burst. With usual keys they take a millisecond of the event loop.
-_HANDSHAKES_PER_S: Final = 250.0
+_HANDSHAKES_PER_S: Final = 500.0
 _HANDSHAKE_BURST_S: Final = 1.0
 # The rate of messages of all connections of a caller, as a multiple of that of one connection.
 _CALLER_RATE: Final = 8.0
