@@ -1,6 +1,6 @@
 """The service on a Ray cluster of several nodes on this machine. `make cluster-check` runs it with three nodes.
 
-Its variables: CLUSTER_NODES and CLUSTER_STREAMS. It prints the times that it measured, which are no assertions.
+Its variables: CLUSTER_NODES and CLUSTER_STREAMS. It prints the times that it measured, and asserts none of them.
 """
 
 from __future__ import annotations

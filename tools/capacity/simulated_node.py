@@ -203,7 +203,7 @@ class SimulatedStream:
         self._protocol.complete_frame(outcome, env.now)
         self._save()
         yield from node.loop_work(service.loop_s / _STEPS)
-        # Frames that were replaced are no longer needed.
+        # Frames that were replaced will not be answered.
         self._services = {seq: each for seq, each in self._services.items() if seq > frame.seq}
         if not self._is_gone:
             self._answer(frame.seq, outcome is FrameOutcome.ANSWERED)

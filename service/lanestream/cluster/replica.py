@@ -85,7 +85,7 @@ class Replica:
         return PeerLoss(app)
 
     async def check_health(self) -> None:
-        """Raises NotReadyError if worker processes that end are no longer replaced: Serve then replaces the replica."""
+        """Raises NotReadyError if the replica cannot replace its worker processes any more: Serve then replaces it."""
         if self._service is not None:
             self._service.check_alive()
 
